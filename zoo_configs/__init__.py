@@ -1,0 +1,1 @@
+"""Training settings as YAML, one file an algorithm."""
