@@ -1,0 +1,285 @@
+"""SB3's DDPG with what goal-conditioned learning from sparse rewards needs besides."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3 import DDPG
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    Schedule,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
+from torch import nn
+
+from .her_replay_buffer import FollowObjectReplayBuffer
+from .policies import HerPolicy
+
+SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
+
+# Transitions drawn from the buffer in one call: enough to spread the fixed cost, small in memory.
+_SAMPLE_CHUNK = 32_768
+# Floor of the standard deviations, so that entries that hardly vary are not blown up.
+_MIN_STD = 0.01
+
+
+class HerDDPG(DDPG):
+    """DDPG as the HER papers run it: normaliser, target clip, action L2, random actions.
+
+    The differences from SB3's DDPG (section 3.2 of the paper and its references):
+
+    - inputs are standardised by running moments of everything stored, clipped to +-5;
+    - the critic's targets are clipped to [-1/(1 - gamma), 0], the range of returns of a -1/0 reward;
+    - the actor's loss has `action_l2` times the mean squared action added;
+    - with probability `random_action_prob` an action is uniform, else Gaussian noise is added;
+    - episodes may be collected from several environments at once: `train_freq=(n, "episode")`;
+    - target networks may be moved once every `target_update_interval` updates.
+
+    Args:
+        env: with Dict observations "observation", "achieved_goal", "desired_goal".
+        gamma: in (0, 1); by default 1 - 1/T for episodes of T steps.
+        train_freq: in episodes of every environment, or in steps of every environment.
+        noise_std: of the Gaussian noise on each action in [-1, 1]; `action_noise` replaces it.
+        random_action_prob: in [0, 1].
+        action_l2: weight, >= 0.
+        target_clip: (low, high) bounds of the targets, "auto" for [-1/(1 - gamma), 0], None for none.
+        target_update_interval: in gradient updates, >= 1. The authors: once a cycle of 40.
+        policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.
+
+    The other arguments are DDPG's.
+
+    Raises:
+        ValueError: for an environment without goals or an argument outside its range.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": HerPolicy}
+    policy: HerPolicy
+    replay_buffer: FollowObjectReplayBuffer | None  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        policy: str | type[HerPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 0,
+        batch_size: int = 512,
+        tau: float = 0.01,
+        gamma: float | None = None,
+        train_freq: int | tuple[int, str] = (1, "episode"),
+        gradient_steps: int = 40,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        noise_std: float = 0.2,
+        random_action_prob: float = 0.3,
+        action_l2: float = 1.0,
+        target_clip: tuple[float, float] | str | None = "auto",
+        target_update_interval: int = 1,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if not 0.0 <= random_action_prob <= 1.0:
+            raise ValueError(f"random_action_prob is {random_action_prob}; it must lie in [0, 1]")
+        if noise_std < 0.0 or action_l2 < 0.0:
+            raise ValueError(f"noise_std ({noise_std}) and action_l2 ({action_l2}) must be >= 0")
+        if target_update_interval < 1:
+            raise ValueError(f"target_update_interval is {target_update_interval}; must be >= 1")
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,  # type: ignore[arg-type]  # resolved in _setup_model
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class or FollowObjectReplayBuffer,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.noise_std = noise_std
+        self.random_action_prob = random_action_prob
+        self.action_l2 = action_l2
+        self.target_clip = target_clip
+        self.target_update_interval = target_update_interval
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        keys = getattr(self.observation_space, "spaces", {})
+        missing = {"observation", "achieved_goal", "desired_goal"} - set(keys)
+        if missing:
+            raise ValueError(
+                f"the environment's observations lack {', '.join(sorted(missing))}; HerDDPG needs a "
+                "goal environment with observation, achieved_goal and desired_goal"
+            )
+        if self.gamma is None:
+            self.gamma = 1.0 - 1.0 / self._horizon()
+        super()._setup_model()
+        self.rng = np.random.default_rng(np.random.randint(2**31))
+        self.moments = RunningMeanStd(shape=(self.actor.features_dim,))
+        self._moments_pos = 0
+        if isinstance(self.train_freq, TrainFreq) and (
+            self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1
+        ):
+            steps = self.train_freq.frequency * self._horizon()
+            self.train_freq = TrainFreq(steps, TrainFrequencyUnit.STEP)
+
+    def _horizon(self) -> int:
+        """Steps of an episode, from the environment's spec."""
+        assert self.env is not None
+        spec = self.env.get_attr("spec", indices=[0])[0]
+        if spec is None or spec.max_episode_steps is None:
+            raise ValueError(
+                "the environment does not say how long its episodes are (spec.max_episode_steps); "
+                "give gamma and train_freq in steps"
+            )
+        return int(spec.max_episode_steps)
+
+    def _sample_action(
+        self,
+        learning_starts: int,
+        action_noise: ActionNoise | None = None,
+        n_envs: int = 1,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        assert self._last_obs is not None
+        if self.num_timesteps < learning_starts:
+            scaled = self.rng.uniform(-1.0, 1.0, size=(n_envs, *self.action_space.shape))
+        else:
+            action, _ = self.predict(self._last_obs, deterministic=True)  # type: ignore[arg-type]
+            scaled = self.policy.scale_action(action)
+            noise = (
+                self.rng.normal(0.0, self.noise_std, size=scaled.shape)
+                if action_noise is None
+                else action_noise()
+            )
+            scaled = np.clip(scaled + noise, -1.0, 1.0)
+            random = self.rng.random(n_envs) < self.random_action_prob
+            scaled[random] = self.rng.uniform(-1.0, 1.0, size=(random.sum(), *scaled.shape[1:]))
+        scaled = scaled.astype(np.float32)
+        return self.policy.unscale_action(scaled), scaled
+
+    def _update_moments(self) -> None:
+        """Take in what was stored since the last call; goals count as shown and as achieved."""
+        buffer = self.replay_buffer
+        assert buffer is not None
+        rows = np.arange(
+            self._moments_pos, buffer.pos + (buffer.pos < self._moments_pos) * buffer.buffer_size
+        )
+        self._moments_pos = buffer.pos
+        if len(rows) == 0:
+            return
+        rows %= buffer.buffer_size
+        obs = buffer.observations["observation"][rows].reshape(len(rows) * self.n_envs, -1)
+        for key in ("desired_goal", "achieved_goal"):
+            goals = buffer.next_observations[key][rows].reshape(len(obs), -1)
+            self.moments.update(np.concatenate([obs, goals], axis=1).astype(np.float64))
+        self.policy.set_moments(
+            th.as_tensor(self.moments.mean, dtype=th.float32),
+            th.as_tensor(np.sqrt(self.moments.var).clip(min=_MIN_STD), dtype=th.float32),
+        )
+
+    def _target_bounds(self) -> tuple[float, float]:
+        if self.target_clip == "auto":
+            return -1.0 / (1.0 - self.gamma), 0.0
+        if self.target_clip is None:
+            return -np.inf, np.inf
+        low, high = self.target_clip
+        return float(low), float(high)
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """Take gradient steps; several batches are drawn from the buffer in one call."""
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        self._update_moments()
+        low, high = self._target_bounds()
+        critics = self.critic.q_networks
+        critics_target = self.critic_target.q_networks
+        actor, actor_target = self.actor.mu, self.actor_target.mu
+        live, target = self._trained_parameters()
+        critic_losses, actor_losses, q_sum = [], [], th.zeros(())
+
+        steps_left = gradient_steps
+        while steps_left > 0:
+            n = min(steps_left, max(1, _SAMPLE_CHUNK // batch_size))
+            steps_left -= n
+            data = self.replay_buffer.sample(n * batch_size, env=self._vec_normalize_env)
+            # All four networks share their input moments, so features are computed once.
+            features = self.actor.features_extractor(data.observations).split(batch_size)
+            next_features = self.actor.features_extractor(data.next_observations).split(batch_size)
+            actions = data.actions.split(batch_size)
+            rewards, dones = data.rewards.split(batch_size), data.dones.split(batch_size)
+            for x, next_x, a, r, d in zip(
+                features, next_features, actions, rewards, dones, strict=True
+            ):
+                self._n_updates += 1
+                with th.no_grad():
+                    next_in = th.cat([next_x, actor_target(next_x)], dim=1)
+                    next_q = _lowest([net(next_in) for net in critics_target])
+                    target_q = (r + (1.0 - d) * self.gamma * next_q).clamp_(low, high)
+                critic_in = th.cat([x, a], dim=1)
+                critic_loss = sum(
+                    nn.functional.mse_loss(net(critic_in), target_q) for net in critics
+                )
+                assert isinstance(critic_loss, th.Tensor)
+                self.critic.optimizer.zero_grad()
+                critic_loss.backward()
+                self.critic.optimizer.step()
+
+                # The actor's gradient passes through the critic, whose own is not wanted.
+                self.critic.requires_grad_(False)
+                policy_actions = actor(x)
+                q = critics[0](th.cat([x, policy_actions], dim=1)).mean()
+                actor_loss = -q + self.action_l2 * policy_actions.square().mean()
+                self.actor.optimizer.zero_grad()
+                actor_loss.backward()
+                self.actor.optimizer.step()
+                self.critic.requires_grad_(True)
+
+                if self._n_updates % self.target_update_interval == 0:
+                    with th.no_grad():
+                        th._foreach_lerp_(target, live, self.tau)
+                critic_losses.append(critic_loss.detach())
+                actor_losses.append(actor_loss.detach())
+                q_sum = q_sum + q.detach()
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/actor_loss", th.stack(actor_losses).mean().item())
+        self.logger.record("train/critic_loss", th.stack(critic_losses).mean().item())
+        self.logger.record("train/q_mean", q_sum.item() / gradient_steps)
+        if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
+            self.logger.record("train/moved_share", self.replay_buffer.moved_share())
+
+    def _trained_parameters(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
+        """Parameters of the live and of the target networks, in the same order."""
+        live = [*self.actor.parameters(), *self.critic.parameters()]
+        target = [*self.actor_target.parameters(), *self.critic_target.parameters()]
+        return live, target
+
+
+def _lowest(q_values: list[th.Tensor]) -> th.Tensor:
+    """Elementwise minimum over critics (n, 1)."""
+    return q_values[0] if len(q_values) == 1 else th.stack(q_values).amin(dim=0)

@@ -1,0 +1,324 @@
+"""A hindsight replay buffer whose sampling does not slow down as it fills."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from .curriculum import Curriculum
+from .goal_predictor import GoalPredictor
+from .imagination import imagine
+
+RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
+
+
+def _imagination_of(env: VecEnv | None) -> tuple[GoalPredictor, Curriculum]:
+    """Find the predictor and the curriculum that the environment's goals come from."""
+    try:
+        if env is not None:
+            predictor = env.get_attr("predictor", indices=[0])[0]
+            return predictor, env.get_attr("curriculum", indices=[0])[0]
+    except AttributeError:
+        pass
+    raise ValueError(
+        "imagined_ratio > 0 needs an environment wrapped in ImaginedGoalVecEnv or "
+        "ImaginedGoalWrapper; this one imagines no goals"
+    )
+
+
+class EpisodeTable:
+    """The finished episodes of the buffer: where each starts and how long it is.
+
+    Sampling draws from this table, never from the slots, so its cost depends on the number of
+    episodes only through a binary search.
+    """
+
+    def __init__(self) -> None:
+        self.start = np.zeros(64, dtype=np.int64)
+        self.env = np.zeros(64, dtype=np.int64)
+        self.length = np.zeros(64, dtype=np.int64)
+        self.moved = np.zeros(64, dtype=bool)
+        self._free = list(range(63, -1, -1))
+        self._draw_lists: dict[bool, tuple[np.ndarray, np.ndarray]] = {}
+
+    def insert(self, start: int, env: int, length: int, moved: bool) -> int:
+        """Add an episode and return its row."""
+        if not self._free:
+            n = len(self.length)
+            for name in ("start", "env", "length", "moved"):
+                array = getattr(self, name)
+                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
+            self._free = list(range(2 * n - 1, n - 1, -1))
+        row = self._free.pop()
+        self.start[row], self.env[row] = start, env
+        self.length[row], self.moved[row] = length, moved
+        self._draw_lists.clear()
+        return row
+
+    def remove(self, row: int) -> None:
+        """Forget the episode in `row`."""
+        self.length[row] = 0
+        self._free.append(row)
+        self._draw_lists.clear()
+
+    def _draw_list(self, moved_only: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Rows to draw from and the running sum of their lengths."""
+        if moved_only not in self._draw_lists:
+            alive = self.length > 0
+            rows = np.flatnonzero(alive & self.moved if moved_only else alive)
+            self._draw_lists[moved_only] = rows, np.cumsum(self.length[rows])
+        return self._draw_lists[moved_only]
+
+    def n_transitions(self, moved_only: bool = False) -> int:
+        """Transitions in finished episodes."""
+        _, ends = self._draw_list(moved_only)
+        return int(ends[-1]) if len(ends) else 0
+
+    def draw(
+        self, n: int, rng: np.random.Generator, moved_only: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draw n transitions uniformly: rows of the table (n,) and steps within them (n,)."""
+        rows, ends = self._draw_list(moved_only)
+        u = rng.integers(ends[-1], size=n)
+        which = np.searchsorted(ends, u, side="right")
+        row = rows[which]
+        return row, u - (ends[which] - self.length[row])
+
+
+class FollowObjectReplayBuffer(HerReplayBuffer):
+    """SB3's HerReplayBuffer with imagined goals, moved-object sampling and float32 storage.
+
+    Takes the place of `HerReplayBuffer` in any off-policy algorithm of SB3 (`replay_buffer_class=`).
+    The distribution of the samples is that of HerReplayBuffer when `imagined_ratio` and
+    `moved_ratio` are 0; a virtual transition is then chosen per transition with probability
+    n_sampled_goal / (n_sampled_goal + 1) rather than in an exact share.
+
+    Args:
+        imagined_ratio: share in [0, 1] of the virtual transitions relabelled with a goal imagined by
+            F_phi from the episode's start and original goal, at a level of the current curriculum,
+            instead of with an achieved goal. 0 is the paper's setting. Above 0, the environment
+            must be wrapped in `ImaginedGoalVecEnv` or `ImaginedGoalWrapper`.
+        moved_ratio: share in [0, 1] of each batch drawn only from episodes in which the achieved
+            goal moved by more than `moved_distance`; the rest is drawn from all. 0 is the paper's.
+        moved_distance: metres.
+        reward_function: called as f(achieved (n, d), desired (n, d), infos) -> (n,); by default the
+            `compute_reward` of the first environment is asked, which costs a round trip between
+            processes in a SubprocVecEnv.
+        seed: of the buffer's own generator; by default drawn from NumPy's global one, which SB3
+            seeds.
+
+    The other arguments are HerReplayBuffer's.
+
+    Raises:
+        ValueError: if a ratio is outside [0, 1] or imagined goals are asked for without the wrapper.
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space,
+        env: VecEnv,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        n_sampled_goal: int = 4,
+        goal_selection_strategy: GoalSelectionStrategy | str = "future",
+        copy_info_dict: bool = False,
+        imagined_ratio: float = 0.0,
+        moved_ratio: float = 0.0,
+        moved_distance: float = 0.01,
+        reward_function: RewardFunction | None = None,
+        seed: int | None = None,
+    ):
+        for name, ratio in (("imagined_ratio", imagined_ratio), ("moved_ratio", moved_ratio)):
+            if not 0.0 <= ratio <= 1.0:
+                raise ValueError(f"{name} is {ratio}; it must lie in [0, 1]")
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            env,
+            device=device,
+            n_envs=n_envs,
+            optimize_memory_usage=optimize_memory_usage,
+            handle_timeout_termination=handle_timeout_termination,
+            n_sampled_goal=n_sampled_goal,
+            goal_selection_strategy=goal_selection_strategy,
+            copy_info_dict=copy_info_dict,
+        )
+        self.imagined_ratio = imagined_ratio
+        self.moved_ratio = moved_ratio
+        self.moved_distance = moved_distance
+        self.reward_function = reward_function
+        if imagined_ratio > 0.0:
+            _imagination_of(env)  # raises the sentence now rather than at the first sample
+        self.rng = np.random.default_rng(np.random.randint(2**31) if seed is None else seed)
+
+        # Physics in float64 is needed while stepping, not while learning.
+        for store in (self.observations, self.next_observations):
+            for key, array in store.items():
+                if array.dtype == np.float64:
+                    store[key] = np.zeros(array.shape, dtype=np.float32)
+        goal_shape = self.observations["desired_goal"].shape
+        self.original_goals = np.zeros(
+            goal_shape if imagined_ratio > 0.0 else (0,), dtype=np.float32
+        )
+        if not copy_info_dict:
+            self.infos = np.empty((0, n_envs), dtype=object)  # one unused dict a slot otherwise
+        self.table = EpisodeTable()
+        self._row_of_slot = np.full((self.buffer_size, n_envs), -1, dtype=np.int32)
+
+    def add(  # type: ignore[override]
+        self,
+        obs: dict[str, np.ndarray],
+        next_obs: dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one step of every environment; arguments as in HerReplayBuffer."""
+        pos = self.pos
+        for row in np.unique(self._row_of_slot[pos]):
+            if row >= 0:
+                self._forget_episode(int(row))
+        self.ep_start[pos] = self._current_ep_start
+        if self.copy_info_dict:
+            self.infos[pos] = infos  # type: ignore[assignment]
+        if self.imagined_ratio > 0.0:
+            self.original_goals[pos] = [info["original_goal"] for info in infos]
+        super(HerReplayBuffer, self).add(obs, next_obs, action, reward, done, infos)
+        for env_idx in np.flatnonzero(done):
+            self._compute_episode_length(int(env_idx))
+
+    def _forget_episode(self, row: int) -> None:
+        """Make an episode that is about to be overwritten invisible to sampling."""
+        env_idx = self.table.env[row]
+        slots = (self.table.start[row] + np.arange(self.table.length[row])) % self.buffer_size
+        self.ep_length[slots, env_idx] = 0
+        self._row_of_slot[slots, env_idx] = -1
+        self.table.remove(row)
+
+    def _compute_episode_length(self, env_idx: int) -> None:
+        start = int(self._current_ep_start[env_idx])
+        super()._compute_episode_length(env_idx)
+        # An episode as long as the whole buffer starts and ends on the same slot.
+        length = (self.pos - start) % self.buffer_size or self.buffer_size
+        slots = (start + np.arange(length)) % self.buffer_size
+        self.ep_length[slots, env_idx] = length
+        path = self.next_observations["achieved_goal"][slots, env_idx]
+        origin = self.observations["achieved_goal"][start, env_idx]
+        moved = np.linalg.norm(path - origin, axis=-1).max() > self.moved_distance
+        self._row_of_slot[slots, env_idx] = self.table.insert(start, env_idx, length, bool(moved))
+
+    def moved_share(self) -> float:
+        """Share of the stored transitions that belong to episodes in which the object moved."""
+        total = self.table.n_transitions()
+        return self.table.n_transitions(moved_only=True) / total if total else 0.0
+
+    def sample(  # type: ignore[override]
+        self, batch_size: int, env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        """Draw transitions and relabel them in one vectorised pass.
+
+        Args:
+            batch_size: number of transitions; several gradient steps' worth may be asked for at
+                once and split, since the draws are independent.
+            env: to normalise observations and rewards, as in SB3.
+
+        Raises:
+            RuntimeError: before the end of the first episode.
+        """
+        if self.table.n_transitions() == 0:
+            raise RuntimeError(
+                "the replay buffer holds no finished episode yet; "
+                "set learning_starts to at least one episode of every environment"
+            )
+        row, step = self._draw(batch_size)
+        env_idx, start = self.table.env[row], self.table.start[row]
+        slot = (start + step) % self.buffer_size
+        flat = slot * self.n_envs + env_idx
+
+        obs = {key: self._take(store, flat) for key, store in self.observations.items()}
+        next_obs = {key: self._take(store, flat) for key, store in self.next_observations.items()}
+        rewards = self._take(self.rewards, flat)
+
+        virtual = np.flatnonzero(self.rng.random(batch_size) < self.her_ratio)
+        if len(virtual):
+            goals = self._hindsight_goals(row[virtual], step[virtual])
+            if self.imagined_ratio > 0.0:
+                chosen = np.flatnonzero(self.rng.random(len(virtual)) < self.imagined_ratio)
+                goals[chosen] = self._imagined_goals(row[virtual[chosen]])
+            obs["desired_goal"][virtual] = goals
+            next_obs["desired_goal"][virtual] = goals
+            infos = list(self.infos[slot, env_idx][virtual]) if self.copy_info_dict else []
+            rewards[virtual] = self._reward(next_obs["achieved_goal"][virtual], goals, infos)
+
+        dones = self._take(self.dones, flat) * (1.0 - self._take(self.timeouts, flat))
+        obs = self._normalize_obs(obs, env)  # type: ignore[assignment]
+        next_obs = self._normalize_obs(next_obs, env)  # type: ignore[assignment]
+        rewards = self._normalize_reward(rewards, env)
+        return DictReplayBufferSamples(
+            observations={key: self._to_tensor(value) for key, value in obs.items()},
+            actions=self._to_tensor(self._take(self.actions, flat)),
+            next_observations={key: self._to_tensor(value) for key, value in next_obs.items()},
+            dones=self._to_tensor(dones).reshape(-1, 1),
+            rewards=self._to_tensor(rewards).reshape(-1, 1),
+        )
+
+    def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        row, step = self.table.draw(n, self.rng)
+        if self.moved_ratio > 0.0 and self.table.n_transitions(moved_only=True):
+            chosen = np.flatnonzero(self.rng.random(n) < self.moved_ratio)
+            row[chosen], step[chosen] = self.table.draw(len(chosen), self.rng, moved_only=True)
+        return row, step
+
+    def _take(self, store: np.ndarray, flat: np.ndarray) -> np.ndarray:
+        """Copy of the (slot, environment) entries with the given flat indices."""
+        return store.reshape(self.buffer_size * self.n_envs, *store.shape[2:]).take(flat, axis=0)
+
+    def _to_tensor(self, array: np.ndarray) -> th.Tensor:
+        return th.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.device)
+
+    def _hindsight_goals(self, row: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Achieved goals of the same episode, by the goal selection strategy (n, d)."""
+        length = self.table.length[row]
+        if self.goal_selection_strategy == GoalSelectionStrategy.FINAL:
+            step = length - 1
+        elif self.goal_selection_strategy == GoalSelectionStrategy.FUTURE:
+            step = self.rng.integers(step, length)
+        else:
+            step = self.rng.integers(0, length)
+        slot = (self.table.start[row] + step) % self.buffer_size
+        return self._take(
+            self.next_observations["achieved_goal"], slot * self.n_envs + self.table.env[row]
+        )
+
+    def _imagined_goals(self, row: np.ndarray) -> np.ndarray:
+        """F_phi(o_1, g, k) of each episode at a level drawn from 1..k_max (n, d)."""
+        predictor, curriculum = _imagination_of(self.env)
+        flat = self.table.start[row] * self.n_envs + self.table.env[row]
+        start = self._take(self.observations["achieved_goal"], flat)
+        goal = self._take(self.original_goals, flat)
+        level = self.rng.integers(1, curriculum.k_max, size=len(row), endpoint=True)
+        return imagine(predictor, curriculum, start, goal, level)
+
+    def _reward(
+        self, achieved: np.ndarray, desired: np.ndarray, infos: list[dict[str, Any]]
+    ) -> np.ndarray:
+        if self.reward_function is not None:
+            return self.reward_function(achieved, desired, infos)
+        if self.env is None:
+            raise RuntimeError("the replay buffer has no environment: call set_env() after loading")
+        infos = infos or [{} for _ in range(len(achieved))]
+        return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]

@@ -1,0 +1,106 @@
+"""Goal-conditioned actor and critic: normalised inputs, optional LayerNorm in the critic."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.td3.policies import TD3Policy
+from torch import nn
+
+
+class NormalizedGoalExtractor(BaseFeaturesExtractor):
+    """Observation and desired goal, standardised and clipped, as one vector.
+
+    The achieved goal is part of the observation already and is left out. The moments are buffers, so
+    they are saved with the policy and `predict` takes raw observations.
+
+    Args:
+        observation_space: Dict with "observation" and "desired_goal".
+        clip: bound on each standardised entry, in standard deviations.
+    """
+
+    mean: th.Tensor
+    std: th.Tensor
+
+    def __init__(self, observation_space: spaces.Dict, clip: float = 5.0):
+        self.keys = ("observation", "desired_goal")
+        dim = sum(get_flattened_obs_dim(observation_space[key]) for key in self.keys)
+        super().__init__(observation_space, dim)
+        self.clip = clip
+        self.register_buffer("mean", th.zeros(dim))
+        self.register_buffer("std", th.ones(dim))
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        """Map a batch of observations to features (n, features_dim)."""
+        inputs = th.cat([observations[key].float() for key in self.keys], dim=-1)
+        return ((inputs - self.mean) / self.std).clamp_(-self.clip, self.clip)
+
+
+class LayerNormCritic(ContinuousCritic):
+    """SB3's critic with LayerNorm after each hidden layer."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        for idx in range(self.n_critics):
+            layers: list[nn.Module] = []
+            for layer in self.q_networks[idx]:  # type: ignore[attr-defined]
+                layers.append(layer)
+                if isinstance(layer, nn.Linear) and layer.out_features > 1:
+                    layers.append(nn.LayerNorm(layer.out_features))
+            q_net = nn.Sequential(*layers)
+            self.add_module(f"qf{idx}", q_net)
+            self.q_networks[idx] = q_net
+
+
+class HerPolicy(TD3Policy):
+    """Actor and critics of three layers of 256 on normalised observations and goals.
+
+    Args:
+        critic_layer_norm: LayerNorm after each hidden layer of the critics. Beyond the paper.
+        features_clip: see `NormalizedGoalExtractor`.
+
+    The other arguments are TD3Policy's.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        critic_layer_norm: bool = False,
+        features_clip: float = 5.0,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ):
+        if "features_extractor_class" in kwargs:
+            raise ValueError(
+                "HerPolicy brings its own features extractor; leave features_extractor_class out"
+            )
+        self.critic_layer_norm = critic_layer_norm
+        super().__init__(
+            *args,
+            net_arch=[256, 256, 256] if net_arch is None else net_arch,
+            features_extractor_class=NormalizedGoalExtractor,
+            features_extractor_kwargs={"clip": features_clip},
+            # One kernel for all parameters: the update is memory-bound otherwise.
+            optimizer_kwargs={"fused": True, **(optimizer_kwargs or {})},
+            **kwargs,
+        )
+
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> ContinuousCritic:
+        """Build one critic (or its target)."""
+        critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        critic_class = LayerNormCritic if self.critic_layer_norm else ContinuousCritic
+        return critic_class(**critic_kwargs).to(self.device)
+
+    def set_moments(self, mean: th.Tensor, std: th.Tensor) -> None:
+        """Give every network the same moments, (features_dim,) each."""
+        for net in (self.actor, self.actor_target, self.critic, self.critic_target):
+            net.features_extractor.mean.copy_(mean)  # type: ignore[union-attr]
+            net.features_extractor.std.copy_(std)  # type: ignore[union-attr]
