@@ -1,0 +1,45 @@
+# Every target works on a bare machine: it makes $(VENV) from $(PYTHON) first when it is not there.
+PYTHON ?= python3.11
+VENV ?= .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+# The main job's task and run folder; a run folder that exists is taken up where it stopped.
+ENV ?= FollowObject/PnPShelf-v0
+RUN ?= runs/pnp-shelf
+
+# mujoco draws through a window unless told otherwise; EGL needs none.
+ifeq ($(shell uname -s),Linux)
+export MUJOCO_GL ?= egl
+endif
+
+.PHONY: train test lint test-mujoco-range clean
+
+train: $(INSTALLED)
+	$(BIN)/sb3-follow-object train --env $(ENV) --run $(RUN) $(if $(wildcard $(RUN)),--resume)
+
+test: lint
+	$(BIN)/pytest -q -n 2 --dist loadgroup
+
+# Builds throwaway environments with the lowest and the highest mujoco that pyproject.toml admits.
+test-mujoco-range: $(INSTALLED)
+	$(BIN)/pytest -q -m mujoco_range
+
+# mypy reads no setuptools package-dir, so it is shown the package in the shape that is installed.
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	rm -rf build/mypy && mkdir -p build/mypy/sb3_follow_object
+	ln -s $(wildcard $(CURDIR)/sb3_follow_object/*) $(CURDIR)/envs $(CURDIR)/zoo_configs \
+		build/mypy/sb3_follow_object/
+	MYPYPATH=build/mypy $(BIN)/mypy -p sb3_follow_object
+
+# torch goes first and by its pin: a range would let pip fetch a newer build with CUDA.
+$(INSTALLED): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install -c constraints.txt torch setuptools wheel
+	$(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[zoo,plots,video,test]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

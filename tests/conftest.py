@@ -1,0 +1,91 @@
+"""Settings that must stand before torch and mujoco are imported, and fixtures that tests share."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+# Small networks and small scenes: more threads only make the test processes wait for each other.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+if sys.platform == "linux":
+    os.environ.setdefault("MUJOCO_GL", "egl")
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = {
+    "sb3_follow_object": ROOT / "sb3_follow_object",
+    "sb3_follow_object/envs": ROOT / "envs",
+    "sb3_follow_object/zoo_configs": ROOT / "zoo_configs",
+}
+
+DRAW_ONE_PICTURE = """
+import mujoco
+renderer = mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
+renderer.close()
+"""
+
+
+@pytest.fixture(scope="session")
+def can_draw() -> None:
+    """Skips where mujoco finds no OpenGL; asks a process of its own, which a driver may end."""
+    tried = subprocess.run(
+        [sys.executable, "-c", DRAW_ONE_PICTURE], capture_output=True, text=True, check=False
+    )
+    if tried.returncode != 0:
+        last_line = (tried.stderr.strip().splitlines() or [f"exit {tried.returncode}"])[-1]
+        pytest.skip(f"no OpenGL for MUJOCO_GL={os.environ.get('MUJOCO_GL', '')}: {last_line}")
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from the source distribution as an installer would, without a download."""
+    source = tmp_path_factory.mktemp("source")
+    for folder in (*PACKAGES.values(), ROOT / "tests"):
+        shutil.copytree(
+            folder, source / folder.name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info")
+        )
+    for file in ROOT.iterdir():
+        if file.is_file():
+            shutil.copy(file, source)
+    built = tmp_path_factory.mktemp("built")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(built), str(source)]
+    run(command)
+    (path,) = built.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="session")
+def bare_python(wheel: Path) -> Callable[..., Path]:
+    """Makes an environment with the wheel in it; what it depends on is seen through a path file.
+
+    Packages named beside the folder are downloaded and come before the ones seen through the path.
+    """
+
+    def make(folder: Path, *packages: str) -> Path:
+        venv.create(folder, with_pip=False, symlinks=True)
+        python = folder / "bin" / "python"
+        pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-deps"]
+        run([*pip, "--no-index", str(wheel)])
+        if packages:
+            run([*pip, *packages])
+        (own,) = folder.glob("lib/python*/site-packages")
+        # A folder that a .pth names does not have its own .pth files read, so the editable install
+        # of this tree stays out of sight.
+        (own / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+        return python
+
+    return make
+
+
+def run(command: list[str], **options: object) -> str:
+    """Runs a command; its output becomes the failure's message."""
+    done = subprocess.run(  # type: ignore[call-overload]
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False, **options
+    )
+    assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}"
+    return str(done.stdout)
