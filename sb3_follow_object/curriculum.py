@@ -1,0 +1,147 @@
+"""The curriculum over imagined goals: which level k an episode plays, and when k_max grows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+LEVELS = ("time", "path")
+SAMPLING = ("uniform", "max")
+
+
+class Curriculum:
+    """Levels 1..k_max of imagined goals, k_max growing with success (paper, section 4.3).
+
+    Each episode shows its original goal with probability ``p`` and otherwise the imagined goal of
+    a level k drawn from U{1..k_max}. A test at level k_max that reaches ``threshold`` raises k_max
+    by one. At the last level the curriculum is finished and shows original goals only.
+
+    Args:
+        horizon: T, steps of an episode, >= 1.
+        p: probability of the original goal, in [0, 1].
+        threshold: success rate at k_max that raises k_max, in [0, 1].
+        k_max: first value of k_max, in 1..n_levels.
+        levels: "time": level k is k time-steps along the path (paper), so there are T levels;
+            "path": level k is the share k / n_levels of the path's length.
+        n_levels: number of levels with levels="path", >= 1; "time" does not read it.
+        sampling: "uniform" (paper) or "max", always k = k_max (the paper's ablation).
+        min_distance: metres, >= 0; imagined goals nearer to the start than this are not shown.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    def __init__(
+        self,
+        horizon: int,
+        *,
+        p: float = 0.2,
+        threshold: float = 0.25,
+        k_max: int = 2,
+        levels: str = "time",
+        n_levels: int = 25,
+        sampling: str = "uniform",
+        min_distance: float = 0.0,
+    ) -> None:
+        _check_choice("levels", levels, LEVELS)
+        _check_choice("sampling", sampling, SAMPLING)
+        _check_integer("horizon", horizon, 1, None)
+        _check_integer("n_levels", n_levels, 1, None)
+        _check_share("p", p)
+        _check_share("threshold", threshold)
+        if not 0.0 <= min_distance < np.inf:
+            raise ValueError(f"min_distance must be >= 0 metres and finite, got {min_distance!r}.")
+        self.horizon = int(horizon)
+        self.levels = levels
+        self.n_levels = self.horizon if levels == "time" else int(n_levels)
+        self.p = float(p)
+        self.threshold = float(threshold)
+        self.sampling = sampling
+        self.min_distance = float(min_distance)
+        self.k_max = self._checked_level("k_max", k_max)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last level is reached, so that only original goals are shown."""
+        return self.k_max == self.n_levels
+
+    def draw(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the coin and the level of ``n`` new episodes.
+
+        Args:
+            n: number of episodes, >= 0.
+            rng: source of randomness.
+
+        Returns:
+            original (n,) bool, True where the episode shows its original goal; level (n,) int64 in
+            1..k_max, meant for the others.
+        """
+        original = rng.random(n) < self.p
+        if self.finished:
+            original[:] = True
+        if self.sampling == "max":
+            return original, np.full(n, self.k_max, dtype=np.int64)
+        return original, rng.integers(1, self.k_max, size=n, endpoint=True)
+
+    def drawable(self) -> np.ndarray:
+        """Return the levels that ``draw`` can give now, shape (m,) int64, ascending."""
+        first = self.k_max if self.sampling == "max" else 1
+        return np.arange(first, self.k_max + 1)
+
+    def report(self, success_rate: float) -> bool:
+        """Take in a test at level k_max; return whether k_max grew.
+
+        Args:
+            success_rate: share of successful test episodes, in [0, 1].
+
+        Raises:
+            ValueError: ``success_rate`` is outside [0, 1].
+        """
+        _check_share("success_rate", success_rate)
+        if self.finished or success_rate < self.threshold:
+            return False
+        self.k_max += 1
+        return True
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what training has changed, and what it only makes sense with (JSON types)."""
+        return {"k_max": self.k_max, "levels": self.levels, "n_levels": self.n_levels}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state``, made by ``state_dict`` of a curriculum with the same levels.
+
+        Raises:
+            ValueError: the state lacks an entry, has other levels, or a k_max outside them.
+        """
+        missing = {"k_max", "levels", "n_levels"} - set(state)
+        if missing:
+            raise ValueError(f"The curriculum's state lacks {sorted(missing)}.")
+        theirs = (state["levels"], state["n_levels"])
+        if theirs != (self.levels, self.n_levels):
+            raise ValueError(
+                f"The curriculum's state has levels={theirs[0]!r} with {theirs[1]!r} levels, "
+                f"but this curriculum has levels={self.levels!r} with {self.n_levels}."
+            )
+        self.k_max = self._checked_level("k_max", state["k_max"])
+
+    def _checked_level(self, name: str, level: int) -> int:
+        _check_integer(name, level, 1, self.n_levels)
+        return int(level)
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {list(choices)}, got {value!r}.")
+
+
+def _check_integer(name: str, value: int, low: int, high: int | None) -> None:
+    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not is_integer or value < low or (high is not None and value > high):
+        upper = f"in {low}..{high}" if high is not None else f">= {low}"
+        raise ValueError(f"{name} must be a whole number {upper}, got {value!r}.")
+
+
+def _check_share(name: str, value: float) -> None:
+    if not 0.0 <= value <= 1.0:  # also refuses NaN
+        raise ValueError(f"{name} must lie in [0, 1], got {value!r}.")

@@ -1,0 +1,114 @@
+"""From a level of the curriculum to an imagined goal."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .curriculum import Curriculum
+from .goal_predictor import GoalPredictor
+
+
+def imagine(
+    predictor: GoalPredictor,
+    curriculum: Curriculum,
+    start: np.ndarray,
+    goal: np.ndarray,
+    level: np.ndarray,
+) -> np.ndarray:
+    """Return the imagined goals h of given levels (paper, section 4.3).
+
+    Args:
+        predictor: F_phi.
+        curriculum: says whether a level means time-steps or a share of the path's length.
+        start: object positions o_1, shape (n, 3), metres.
+        goal: original goals g, shape (n, 3), metres.
+        level: shape (n,) int, in 1..curriculum.n_levels.
+
+    Returns:
+        h, shape (n, 3) float64, metres.
+
+    Raises:
+        ValueError: a shape or a level is wrong.
+    """
+    level = np.asarray(level)
+    if level.size and not (level.min() >= 1 and level.max() <= curriculum.n_levels):
+        raise ValueError(f"Levels must lie in 1..{curriculum.n_levels}, got {level.tolist()}.")
+    if curriculum.levels == "time":
+        return predictor.predict(start, goal, level)
+    return _all_levels(predictor, curriculum, start, goal)[np.arange(len(level)), level - 1]
+
+
+def draw_goals(
+    predictor: GoalPredictor,
+    curriculum: Curriculum,
+    start: np.ndarray,
+    goal: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw the goal that each of n new training episodes shows (paper, Algorithm 1).
+
+    With ``curriculum.min_distance`` > 0 a level whose goal lies nearer to the start than that is
+    drawn again among those levels up to k_max that lie far enough; an episode that has none shows
+    its original goal.
+
+    Args:
+        predictor: F_phi.
+        curriculum: draws the coin and the level of each episode.
+        start: object positions o_1, shape (n, 3), metres.
+        goal: original goals g, shape (n, 3), metres.
+        rng: source of randomness.
+
+    Returns:
+        shown goals, shape (n, 3) float64, metres; levels, shape (n,) int64, 0 where original.
+    """
+    shown = np.array(goal, dtype=np.float64)
+    original, level = curriculum.draw(len(shown), rng)
+    level[original] = 0
+    rows = np.flatnonzero(~original)
+    if not rows.size:
+        return shown, level
+    shown[rows] = imagine(predictor, curriculum, start[rows], goal[rows], level[rows])
+    distance = np.linalg.norm(shown[rows] - start[rows], axis=1)
+    near = rows[distance < curriculum.min_distance]
+    if near.size:
+        choices = curriculum.drawable()
+        ways = _all_levels(predictor, curriculum, start[near], goal[near])[:, choices - 1]
+        far = np.linalg.norm(ways - start[near, None], axis=2) >= curriculum.min_distance
+        for row, way, mask in zip(near, ways, far, strict=True):
+            # One draw among the far levels has the distribution of drawing until a level is far.
+            choice = rng.choice(np.flatnonzero(mask)) if mask.any() else None
+            level[row] = 0 if choice is None else choices[choice]
+            shown[row] = goal[row] if choice is None else way[choice]
+    return shown, level
+
+
+def _all_levels(
+    predictor: GoalPredictor, curriculum: Curriculum, start: np.ndarray, goal: np.ndarray
+) -> np.ndarray:
+    """Return the imagined goals of every level, shape (n, n_levels, 3)."""
+    paths = predictor.paths(start, goal)
+    if curriculum.levels == "time":
+        return paths[:, 1:]
+    return points_along(paths, np.arange(1, curriculum.n_levels + 1) / curriculum.n_levels)
+
+
+def points_along(paths: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Interpolate paths at shares of their length.
+
+    Args:
+        paths: shape (n, m, 3), m >= 2, metres.
+        shares: shape (s,), in [0, 1].
+
+    Returns:
+        points, shape (n, s, 3); share 1 is the path's end.
+    """
+    steps = np.linalg.norm(np.diff(paths, axis=1), axis=2)
+    travelled = np.concatenate([np.zeros((len(paths), 1)), np.cumsum(steps, axis=1)], axis=1)
+    wanted = travelled[:, -1:] * shares  # (n, s)
+    # Index of the step in which the wanted length is reached.
+    step = np.sum(travelled[:, None, 1:-1] < wanted[:, :, None], axis=2)
+    row = np.arange(len(paths))[:, None]
+    # A path of length zero stays where it is: nothing to divide.
+    length = np.maximum(steps[row, step], np.finfo(np.float64).tiny)
+    part = np.clip((wanted - travelled[row, step]) / length, 0.0, 1.0)[..., None]
+    return (1.0 - part) * paths[row, step] + part * paths[row, step + 1]
