@@ -38,7 +38,8 @@ class CurriculumCallback(BaseCallback):
             and when no training episode is half-way.
 
     Attributes:
-        test_steps: environment steps spent in tests so far, all copies counted.
+        test_steps: environment steps spent in tests so far, all copies counted; they are part of
+            the model's num_timesteps.
 
     Raises:
         ValueError: an argument is outside its range, or test_env does not show h_max.
@@ -106,6 +107,7 @@ class CurriculumCallback(BaseCallback):
         if isinstance(buffer, HerReplayBuffer):
             _close_episodes(buffer)
         self.test_steps += episodes.env_steps
+        self.model.num_timesteps += episodes.env_steps  # tests cost steps like any others
         self.logger.record("curriculum/test_success", episodes.success_rate)
         if self.curriculum.report(episodes.success_rate):
             self._share_curriculum()
@@ -161,9 +163,11 @@ class OriginalGoalEvalCallback(BaseCallback):
             loaded state loses those, so that a resumed run repeats none.
         curriculum_callback: its tests are counted in env_steps and its k_max is noted.
         object_steps: steps that the object policy took, counted in env_steps, >= 0.
+        wall_before: seconds that the object stage took, counted in wall_s.
 
     Attributes:
         success_rate: of the last evaluation, None before the first.
+        n_evaluations: evaluations so far.
 
     Raises:
         ValueError: an argument is outside its range, or the CSV file belongs to another run.
@@ -189,6 +193,7 @@ class OriginalGoalEvalCallback(BaseCallback):
         csv_path: str | os.PathLike[str] | None = None,
         curriculum_callback: CurriculumCallback | None = None,
         object_steps: int = 0,
+        wall_before: float = 0.0,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
@@ -204,13 +209,14 @@ class OriginalGoalEvalCallback(BaseCallback):
         self.success_rate: float | None = None
         self._rows: list[dict[str, Any]] = []
         self._last_steps = 0
-        self._wall_before = 0.0
+        self.n_evaluations = 0
+        self._wall_before = wall_before
         self._started = time.monotonic()
 
     @property
     def env_steps(self) -> int:
         """Environment steps so far: training, tests of the curriculum, object policy."""
-        return self.num_timesteps + self._test_steps + self.object_steps
+        return self.model.num_timesteps + self.object_steps
 
     @property
     def _test_steps(self) -> int:
@@ -222,17 +228,21 @@ class OriginalGoalEvalCallback(BaseCallback):
         return {
             "last_steps": self._last_steps,
             "success_rate": self.success_rate,
-            "wall_s": self._wall(),
+            "n_evaluations": self.n_evaluations,
+            "wall_s": self.wall_s,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``."""
         self._last_steps = int(state["last_steps"])
         self.success_rate = state["success_rate"]
+        self.n_evaluations = int(state["n_evaluations"])
         self._wall_before = float(state["wall_s"])
         self._started = time.monotonic()
 
-    def _wall(self) -> float:
+    @property
+    def wall_s(self) -> float:
+        """Seconds of training so far, those before an interruption included."""
         return self._wall_before + time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
@@ -244,9 +254,11 @@ class OriginalGoalEvalCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        if self.num_timesteps - self._last_steps < self.every_steps:
+        num_timesteps = self.model.num_timesteps
+        if num_timesteps - self._last_steps < self.every_steps:
             return
-        self._last_steps = self.num_timesteps
+        self._last_steps = num_timesteps
+        self.n_evaluations += 1
         episodes = run_episodes(noise_free(self.model), self.eval_env, self.n_episodes)
         self.success_rate = episodes.success_rate
         mean_return = float(episodes.returns.mean())
@@ -258,10 +270,10 @@ class OriginalGoalEvalCallback(BaseCallback):
         callback = self.curriculum_callback
         values = (
             self.env_steps,
-            self.num_timesteps,
+            num_timesteps - self._test_steps,
             self._test_steps,
             self.object_steps,
-            round(self._wall(), 1),
+            round(self.wall_s, 1),
             round(self.success_rate, 4),
             round(mean_return, 4),
             self.n_episodes,
@@ -284,7 +296,11 @@ class OriginalGoalEvalCallback(BaseCallback):
                 f"{path} holds another run's evaluations: give another file, or load the state "
                 "that they belong to."
             )
-        return [row for row in rows if int(row["train_steps"]) <= self._last_steps]
+
+        def steps(row: dict[str, Any]) -> int:
+            return int(row["train_steps"]) + int(row["test_steps"])
+
+        return [row for row in rows if steps(row) <= self._last_steps]
 
     def _write_csv(self, path: Path) -> None:
         text = io.StringIO()

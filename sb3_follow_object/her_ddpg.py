@@ -36,7 +36,7 @@ class HerDDPG(DDPG):
     The differences from SB3's DDPG (section 3.2 of the paper and its references):
 
     - inputs are standardised by running moments of everything stored, clipped to +-5;
-    - the critic's targets are clipped to [-1/(1 - gamma), 0], the range of returns of a -1/0 reward;
+    - the critic's targets are clipped to [-1/(1 - gamma), 0], where returns of a -1/0 reward lie;
     - the actor's loss has `action_l2` times the mean squared action added;
     - with probability `random_action_prob` an action is uniform, else Gaussian noise is added;
     - episodes may be collected from several environments at once: `train_freq=(n, "episode")`;
@@ -49,7 +49,7 @@ class HerDDPG(DDPG):
         noise_std: of the Gaussian noise on each action in [-1, 1]; `action_noise` replaces it.
         random_action_prob: in [0, 1].
         action_l2: weight, >= 0.
-        target_clip: (low, high) bounds of the targets, "auto" for [-1/(1 - gamma), 0], None for none.
+        target_clip: (low, high) bounds of the targets; "auto" is [-1/(1 - gamma), 0]; None, none.
         target_update_interval: in gradient updates, >= 1. The authors: once a cycle of 40.
         policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.
 
@@ -60,6 +60,7 @@ class HerDDPG(DDPG):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": HerPolicy}
+    _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
     policy: HerPolicy
     replay_buffer: FollowObjectReplayBuffer | None  # type: ignore[assignment]
 
@@ -132,8 +133,8 @@ class HerDDPG(DDPG):
         missing = {"observation", "achieved_goal", "desired_goal"} - set(keys)
         if missing:
             raise ValueError(
-                f"the environment's observations lack {', '.join(sorted(missing))}; HerDDPG needs a "
-                "goal environment with observation, achieved_goal and desired_goal"
+                f"the environment's observations lack {', '.join(sorted(missing))}; HerDDPG needs "
+                "a goal environment with observation, achieved_goal and desired_goal"
             )
         if self.gamma is None:
             self.gamma = 1.0 - 1.0 / self._horizon()
@@ -201,11 +202,49 @@ class HerDDPG(DDPG):
             th.as_tensor(np.sqrt(self.moments.var).clip(min=_MIN_STD), dtype=th.float32),
         )
 
+    def training_state(self) -> dict[str, Any]:
+        """Return everything that the next rollout and update depend on, between rollouts.
+
+        The environment has its own state, and so has the replay buffer.
+        """
+        return {
+            "policy": self.policy.state_dict(),
+            "actor_optimizer": self.actor.optimizer.state_dict(),
+            "critic_optimizer": self.critic.optimizer.state_dict(),
+            "moments": {
+                "mean": self.moments.mean,
+                "var": self.moments.var,
+                "count": float(self.moments.count),
+                "pos": self._moments_pos,
+            },
+            "rng": self.rng.bit_generator.state,
+            "last_obs": self._last_obs,
+            "counters": {name: getattr(self, name) for name in self._COUNTERS},
+        }
+
+    def load_training_state(self, state: dict[str, Any]) -> None:
+        """Continue from `training_state` of an algorithm with the same networks."""
+        self.policy.load_state_dict(state["policy"])
+        self.actor.optimizer.load_state_dict(state["actor_optimizer"])
+        self.critic.optimizer.load_state_dict(state["critic_optimizer"])
+        moments = state["moments"]
+        self.moments.mean, self.moments.var = moments["mean"].copy(), moments["var"].copy()
+        self.moments.count, self._moments_pos = moments["count"], moments["pos"]
+        self.rng.bit_generator.state = state["rng"]
+        self._last_obs = state["last_obs"]
+        self._last_episode_starts = np.ones(self.n_envs, dtype=bool)
+        for name in self._COUNTERS:
+            setattr(self, name, state["counters"][name])
+
     def _target_bounds(self) -> tuple[float, float]:
         if self.target_clip == "auto":
             return -1.0 / (1.0 - self.gamma), 0.0
         if self.target_clip is None:
             return -np.inf, np.inf
+        if isinstance(self.target_clip, str):
+            raise ValueError(
+                f'target_clip is {self.target_clip!r}; give (low, high), "auto" or None'
+            )
         low, high = self.target_clip
         return float(low), float(high)
 
@@ -275,8 +314,11 @@ class HerDDPG(DDPG):
 
     def _trained_parameters(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
         """Parameters of the live and of the target networks, in the same order."""
-        live = [*self.actor.parameters(), *self.critic.parameters()]
-        target = [*self.actor_target.parameters(), *self.critic_target.parameters()]
+        live: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
+        target: list[th.Tensor] = [
+            *self.actor_target.parameters(),
+            *self.critic_target.parameters(),
+        ]
         return live, target
 
 

@@ -41,6 +41,8 @@ class EpisodeTable:
     episodes only through a binary search.
     """
 
+    _ARRAYS = ("start", "env", "length", "moved")
+
     def __init__(self) -> None:
         self.start = np.zeros(64, dtype=np.int64)
         self.env = np.zeros(64, dtype=np.int64)
@@ -53,7 +55,7 @@ class EpisodeTable:
         """Add an episode and return its row."""
         if not self._free:
             n = len(self.length)
-            for name in ("start", "env", "length", "moved"):
+            for name in self._ARRAYS:
                 array = getattr(self, name)
                 setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
             self._free = list(range(2 * n - 1, n - 1, -1))
@@ -67,6 +69,17 @@ class EpisodeTable:
         """Forget the episode in `row`."""
         self.length[row] = 0
         self._free.append(row)
+        self._draw_lists.clear()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next draws depend on."""
+        return {**{name: getattr(self, name) for name in self._ARRAYS}, "free": self._free}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        for name in self._ARRAYS:
+            setattr(self, name, state[name].copy())
+        self._free = list(state["free"])
         self._draw_lists.clear()
 
     def _draw_list(self, moved_only: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -96,16 +109,16 @@ class EpisodeTable:
 class FollowObjectReplayBuffer(HerReplayBuffer):
     """SB3's HerReplayBuffer with imagined goals, moved-object sampling and float32 storage.
 
-    Takes the place of `HerReplayBuffer` in any off-policy algorithm of SB3 (`replay_buffer_class=`).
+    Takes the place of `HerReplayBuffer` in any off-policy algorithm of SB3.
     The distribution of the samples is that of HerReplayBuffer when `imagined_ratio` and
     `moved_ratio` are 0; a virtual transition is then chosen per transition with probability
     n_sampled_goal / (n_sampled_goal + 1) rather than in an exact share.
 
     Args:
-        imagined_ratio: share in [0, 1] of the virtual transitions relabelled with a goal imagined by
-            F_phi from the episode's start and original goal, at a level of the current curriculum,
-            instead of with an achieved goal. 0 is the paper's setting. Above 0, the environment
-            must be wrapped in `ImaginedGoalVecEnv` or `ImaginedGoalWrapper`.
+        imagined_ratio: share in [0, 1] of the virtual transitions relabelled with a goal that
+            F_phi imagines from the episode's start and original goal, at a level of the current
+            curriculum, instead of with an achieved goal. 0 is the paper's setting. Above 0, the
+            environment must be wrapped in `ImaginedGoalVecEnv` or `ImaginedGoalWrapper`.
         moved_ratio: share in [0, 1] of each batch drawn only from episodes in which the achieved
             goal moved by more than `moved_distance`; the rest is drawn from all. 0 is the paper's.
         moved_distance: metres.
@@ -118,7 +131,8 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
     The other arguments are HerReplayBuffer's.
 
     Raises:
-        ValueError: if a ratio is outside [0, 1] or imagined goals are asked for without the wrapper.
+        ValueError: if a ratio is outside [0, 1], or imagined goals are asked for without the
+            wrapper that imagines them.
     """
 
     def __init__(
@@ -220,6 +234,48 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         origin = self.observations["achieved_goal"][start, env_idx]
         moved = np.linalg.norm(path - origin, axis=-1).max() > self.moved_distance
         self._row_of_slot[slots, env_idx] = self.table.insert(start, env_idx, length, bool(moved))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the content and the generator, as views that later additions change."""
+        used = self.buffer_size if self.full else self.pos
+        return {
+            "pos": self.pos,
+            "full": self.full,
+            "current_episode_start": self._current_ep_start,
+            "slots": {name: store[:used] for name, store in self._stores().items()},
+            "table": self.table.state_dict(),
+            "rng": self.rng.bit_generator.state,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict` of a buffer of the same shape.
+
+        Raises:
+            ValueError: the state belongs to a buffer with other stores or shapes.
+        """
+        stores, slots = self._stores(), state["slots"]
+        if set(stores) != set(slots) or any(
+            len(slots[name]) > len(store) or slots[name].shape[1:] != store.shape[1:]
+            for name, store in stores.items()
+        ):
+            raise ValueError("the saved replay buffer has another shape than this one")
+        for name, store in stores.items():
+            store[: len(slots[name])] = slots[name]
+        self.pos, self.full = state["pos"], state["full"]
+        self._current_ep_start = state["current_episode_start"].copy()
+        self.table.load_state_dict(state["table"])
+        self.rng.bit_generator.state = state["rng"]
+
+    def _stores(self) -> dict[str, np.ndarray]:
+        """Every array with one entry a slot."""
+        stores = {f"observations.{key}": value for key, value in self.observations.items()}
+        stores |= {f"next_observations.{key}": v for key, v in self.next_observations.items()}
+        for name in ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length"):
+            stores[name] = getattr(self, name)
+        stores["row_of_slot"] = self._row_of_slot
+        if self.imagined_ratio > 0.0:
+            stores["original_goals"] = self.original_goals
+        return stores
 
     def moved_share(self) -> float:
         """Share of the stored transitions that belong to episodes in which the object moved."""

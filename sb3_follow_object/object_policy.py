@@ -99,7 +99,7 @@ def train_object_policy(
     """Learn the object policy nu by DDPG + HER and stop as soon as it solves the task.
 
     Args:
-        env: vectorised object-only environment, e.g. ObjectVecEnv("FollowObject/PnPShelfObject-v0", 16).
+        env: vectorised object-only environment, e.g. of FollowObject/PnPShelfObject-v0.
         test_env: fresh copies of it.
         total_timesteps: env steps after which training ends unsolved; tests are counted.
         success_rate: noise-free success that counts as solved, in two tests in a row.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import torch as th
@@ -9,15 +10,18 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.td3.policies import TD3Policy
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
+
+from .checkpoint import load_tree, save_tree
 
 
 class NormalizedGoalExtractor(BaseFeaturesExtractor):
     """Observation and desired goal, standardised and clipped, as one vector.
 
-    The achieved goal is part of the observation already and is left out. The moments are buffers, so
-    they are saved with the policy and `predict` takes raw observations.
+    The achieved goal is part of the observation already and is left out. The moments are buffers,
+    so they are saved with the policy and `predict` takes raw observations.
 
     Args:
         observation_space: Dict with "observation" and "desired_goal".
@@ -69,10 +73,12 @@ class HerPolicy(TD3Policy):
 
     def __init__(
         self,
-        *args: Any,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
         critic_layer_norm: bool = False,
         features_clip: float = 5.0,
-        net_arch: list[int] | dict[str, list[int]] | None = None,
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
@@ -82,7 +88,9 @@ class HerPolicy(TD3Policy):
             )
         self.critic_layer_norm = critic_layer_norm
         super().__init__(
-            *args,
+            observation_space,
+            action_space,
+            lr_schedule,
             net_arch=[256, 256, 256] if net_arch is None else net_arch,
             features_extractor_class=NormalizedGoalExtractor,
             features_extractor_kwargs={"clip": features_clip},
@@ -102,5 +110,42 @@ class HerPolicy(TD3Policy):
     def set_moments(self, mean: th.Tensor, std: th.Tensor) -> None:
         """Give every network the same moments, (features_dim,) each."""
         for net in (self.actor, self.actor_target, self.critic, self.critic_target):
-            net.features_extractor.mean.copy_(mean)  # type: ignore[union-attr]
-            net.features_extractor.std.copy_(std)  # type: ignore[union-attr]
+            extractor = net.features_extractor
+            assert isinstance(extractor, NormalizedGoalExtractor)
+            extractor.mean.copy_(mean)
+            extractor.std.copy_(std)
+
+
+def save_actor(path: str | os.PathLike[str], actor: Actor, env_id: str) -> None:
+    """Save an actor and its normaliser alone: a small file, without pickle.
+
+    Args:
+        path: file to create or replace, e.g. policy.safetensors.
+        actor: of a `HerPolicy`.
+        env_id: the task that it was trained for.
+    """
+    save_tree(path, {"env_id": env_id, "net_arch": actor.net_arch, "actor": actor.state_dict()})
+
+
+def load_actor(
+    path: str | os.PathLike[str], observation_space: spaces.Dict, action_space: spaces.Box
+) -> tuple[Actor, str]:
+    """Load what `save_actor` wrote; the actor has SB3's `predict`.
+
+    Returns:
+        The actor and the id of the task that it was trained for.
+
+    Raises:
+        ValueError: the file is missing, damaged or made for other spaces.
+    """
+    saved = load_tree(path)
+    try:
+        extractor = NormalizedGoalExtractor(observation_space)
+        actor = Actor(
+            observation_space, action_space, saved["net_arch"], extractor, extractor.features_dim
+        )
+        actor.load_state_dict(saved["actor"])
+        actor.set_training_mode(False)
+        return actor, str(saved["env_id"])
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{path} is not a policy for this environment ({error})") from error

@@ -22,7 +22,7 @@ class Episodes:
 
     Attributes:
         success: (n,) bool, `is_success` at the last step of each episode, for the goal shown.
-        original_success: (n,) bool, the same for the task's own goal (equal where none was imagined).
+        original_success: (n,) bool, the same for the task's own goal.
         returns: (n,) float, undiscounted sum of the rewards.
         env_steps: steps simulated, all copies counted, episodes that were not needed included.
     """

@@ -1,0 +1,383 @@
+"""Follow the Object: the three stages of the paper behind one `learn()`."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from .callbacks import CurriculumCallback
+from .checkpoint import load_tree, save_tree
+from .curriculum import Curriculum
+from .envs import make_vec, object_id, physics_id
+from .files import atomic_write
+from .goal_predictor import GoalPredictor
+from .her_ddpg import HerDDPG
+from .object_policy import collect_paths, train_object_policy
+from .policies import save_actor
+from .wrappers import ImaginedGoalVecEnv
+
+# Copies of the object's environment; it is cheap, and the robot's number need not suit it.
+_OBJECT_COPIES = 16
+
+Report = Callable[[str], None]
+
+
+def stream_seed(seed: int, purpose: str) -> int:
+    """Return the seed of one random stream of a run, below 2**31 - 1000.
+
+    Args:
+        seed: the run's seed, >= 0.
+        purpose: any name; different names give unrelated streams.
+    """
+    words = [seed, *purpose.encode()]
+    return int(np.random.SeedSequence(words).generate_state(1)[0]) % (2**31 - 1000)
+
+
+class FollowObject:
+    """Teach a robot a far goal by letting the object find the way first.
+
+    `learn()` runs the three stages of the paper (section 4): the object alone learns to reach the
+    goal; its paths train F_phi; the robot trains on original goals and on the goals that F_phi
+    imagines at growing distance.
+
+    Args:
+        env_id: a task of this package, e.g. "FollowObject/PnPShelf-v0".
+        imagine: False trains the robot on original goals only, i.e. DDPG + HER: no object stage.
+        predictor: an F_phi made before for this task; skips the first two stages.
+        n_envs: parallel copies of the robot's environment, >= 1.
+        n_threads: of the simulation; by default as many as there are cores.
+        reward_type: "sparse" (paper) or "dense".
+        algorithm: keyword arguments of the robot's `HerDDPG`.
+        curriculum: keyword arguments of `Curriculum` besides the horizon.
+        object_algorithm: keyword arguments of the object's `HerDDPG`.
+        object_timesteps: env steps after which the object stage gives up.
+        n_paths: noise-free object paths that F_phi is fitted on.
+        predictor_fit: keyword arguments of `GoalPredictor.fit`.
+        test_every: rollouts of every copy between two tests at k_max.
+        n_test_episodes: episodes a test; by default `n_envs`.
+        store_tests: whether the episodes of the tests enter the replay buffer.
+        seed: decides the whole run.
+        report: called with a sentence as stages begin and end.
+
+    Attributes:
+        model: the robot's `HerDDPG`, once the third stage has begun.
+        predictor: F_phi, once the second stage has ended.
+        object_steps: env steps that the first two stages cost.
+
+    Raises:
+        ValueError: unknown task, a predictor made for another one, or an argument out of range.
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        *,
+        imagine: bool = True,
+        predictor: GoalPredictor | None = None,
+        n_envs: int = 16,
+        n_threads: int | None = None,
+        reward_type: str = "sparse",
+        algorithm: dict[str, Any] | None = None,
+        curriculum: dict[str, Any] | None = None,
+        object_algorithm: dict[str, Any] | None = None,
+        object_timesteps: int = 400_000,
+        n_paths: int = 1024,
+        predictor_fit: dict[str, Any] | None = None,
+        test_every: int = 1,
+        n_test_episodes: int | None = None,
+        store_tests: bool = True,
+        seed: int = 0,
+        report: Report | None = None,
+    ):
+        self.settings: dict[str, Any] = {
+            "env_id": env_id,
+            "imagine": imagine,
+            "n_envs": n_envs,
+            "n_threads": n_threads,
+            "reward_type": reward_type,
+            "algorithm": dict(algorithm or {}),
+            "curriculum": dict(curriculum or {}),
+            "object_algorithm": dict(object_algorithm or {}),
+            "object_timesteps": object_timesteps,
+            "n_paths": n_paths,
+            "predictor_fit": dict(predictor_fit or {}),
+            "test_every": test_every,
+            "n_test_episodes": n_envs if n_test_episodes is None else n_test_episodes,
+            "store_tests": store_tests,
+            "seed": seed,
+        }
+        if n_envs < 1:
+            raise ValueError(f"n_envs is {n_envs}; it must be at least 1")
+        for name, given, function in (
+            ("algorithm", algorithm, HerDDPG.__init__),
+            ("curriculum", curriculum, Curriculum.__init__),
+            ("object_algorithm", object_algorithm, HerDDPG.__init__),
+            ("predictor_fit", predictor_fit, GoalPredictor.fit),
+        ):
+            _check_keywords(name, given or {}, function)
+        self.env_id = env_id
+        self.imagine = imagine
+        self.seed = seed
+        self.report = report or (lambda sentence: None)
+        self.env: VecEnv = self._robot_env("robot")
+        self.horizon = int(self.env.get_attr("spec", indices=[0])[0].max_episode_steps)
+        self.curriculum = Curriculum(self.horizon, **self.settings["curriculum"])
+        self.model: HerDDPG | None = None
+        self.curriculum_callback: CurriculumCallback | None = None
+        self.predictor: GoalPredictor | None = None
+        self.object_steps = 0
+        self.object_success = float("nan")
+        if predictor is not None:
+            self.use_predictor(predictor)
+
+    # ---- stages one and two -------------------------------------------------------------------
+
+    def use_predictor(self, predictor: GoalPredictor) -> None:
+        """Take an F_phi that was made before.
+
+        Raises:
+            ValueError: it was made for another task or for other physics.
+        """
+        if predictor.env_id != self.env_id or predictor.physics != physics_id(self.env_id):
+            raise ValueError(
+                f"the predictor was made for {predictor.env_id} (physics {predictor.physics}), "
+                f"not for {self.env_id} (physics {physics_id(self.env_id)}); make a new one"
+            )
+        self.predictor = predictor
+
+    def learn_predictor(self) -> GoalPredictor:
+        """Run stages one and two: object policy, then F_phi (sections 4.1 and 4.2)."""
+        settings = self.settings
+        self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
+        envs = {name: self._object_env(name) for name in ("object", "object_test", "paths")}
+        model, solved = train_object_policy(
+            envs["object"],
+            envs["object_test"],
+            settings["object_timesteps"],
+            seed=stream_seed(self.seed, "object"),
+            report=lambda steps, rate: self.report(f"  {steps:>7} steps: success {rate:.2f}"),
+            **settings["object_algorithm"],
+        )
+        paths = collect_paths(model, envs["paths"], settings["n_paths"])
+        for env in envs.values():
+            env.close()
+        self.object_steps = model.num_timesteps + paths.env_steps
+        self.object_success = paths.success_rate
+        self.report(
+            f"  {self.object_steps} env steps, noise-free success {paths.success_rate:.2f}"
+            + ("" if solved.solved else " (not solved: its imagined goals may mislead)")
+        )
+        self.report("stage 2: F_phi learns to imagine goals")
+        self.predictor = GoalPredictor.fit(
+            paths.positions,
+            paths.goals,
+            env_id=self.env_id,
+            physics=physics_id(self.env_id),
+            seed=stream_seed(self.seed, "predictor"),
+            **settings["predictor_fit"],
+        )
+        self.report(f"  held-out error {float(np.mean(self.predictor.error_mm)):.1f} mm")
+        return self.predictor
+
+    # ---- stage three --------------------------------------------------------------------------
+
+    @property
+    def env_steps(self) -> int:
+        """Env steps so far: the object's, the robot's and those of the curriculum's tests."""
+        return self.object_steps + (self.model.num_timesteps if self.model else 0)
+
+    @property
+    def test_steps(self) -> int:
+        """Env steps of the curriculum's tests, part of `env_steps`."""
+        return self.curriculum_callback.test_steps if self.curriculum_callback else 0
+
+    def prepare(self) -> HerDDPG:
+        """Run the stages that are missing before the robot can train; build its algorithm."""
+        if self.model is not None:
+            return self.model
+        if self.imagine:
+            predictor = self.predictor or self.learn_predictor()
+            test_env = self._robot_env("test")
+            self.env = ImaginedGoalVecEnv(self.env, predictor, self.curriculum)
+            test_env = ImaginedGoalVecEnv(test_env, predictor, self.curriculum, mode="test")
+            test_env.seed(stream_seed(self.seed, "test"))
+            self.curriculum_callback = CurriculumCallback(
+                test_env,
+                self.settings["n_test_episodes"],
+                every=self.settings["test_every"],
+                store=self.settings["store_tests"],
+            )
+        arguments: dict[str, Any] = {"policy": "MultiInputPolicy", **self.settings["algorithm"]}
+        self.model = HerDDPG(env=self.env, seed=stream_seed(self.seed, "networks"), **arguments)
+        # SB3 seeds the environment too; a run's streams are its own.
+        self.env.seed(stream_seed(self.seed, "robot"))
+        return self.model
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = None,
+        progress_bar: bool = False,
+    ) -> FollowObject:
+        """Train until `env_steps` reaches `total_timesteps`; may be called again with more.
+
+        Args:
+            total_timesteps: env steps in all, object stage and tests included.
+            callback: of SB3, called while the robot trains.
+            log_interval: episodes between two log lines of SB3.
+            progress_bar: SB3's.
+        """
+        model = self.prepare()
+        remaining = total_timesteps - self.env_steps
+        if remaining <= 0:
+            return self
+        callbacks: list[BaseCallback] = []
+        if self.curriculum_callback is not None:
+            callbacks.append(self.curriculum_callback)
+        if isinstance(callback, list):
+            callbacks += callback
+        elif isinstance(callback, BaseCallback):
+            callbacks.append(callback)
+        model.learn(
+            remaining,
+            callback=CallbackList(callbacks),
+            log_interval=log_interval,  # type: ignore[arg-type]
+            reset_num_timesteps=False,
+            progress_bar=progress_bar,
+        )
+        return self
+
+    def predict(
+        self, observation: dict[str, np.ndarray], deterministic: bool = True
+    ) -> tuple[np.ndarray, None]:
+        """Return the robot's actions, as SB3's `predict`."""
+        if self.model is None:
+            raise ValueError("nothing has been learned yet: call learn() first")
+        return self.model.predict(observation, deterministic=deterministic)  # type: ignore
+
+    # ---- saving -------------------------------------------------------------------------------
+
+    def state_dict(self, replay_buffer: bool = True) -> dict[str, Any]:
+        """Return what `learn` has changed, at an episode's end of every copy."""
+        state: dict[str, Any] = {
+            "object_steps": self.object_steps,
+            "object_success": self.object_success,
+            "curriculum": self.curriculum.state_dict(),
+        }
+        if self.model is not None:
+            state["model"] = self.model.training_state()
+            state["env"] = _env_state(self.env)
+            if self.curriculum_callback is not None:
+                state["callback"] = self.curriculum_callback.state_dict()
+                state["test_env"] = _env_state(self.curriculum_callback.test_env)
+            if replay_buffer:
+                assert self.model.replay_buffer is not None
+                state["replay_buffer"] = self.model.replay_buffer.state_dict()
+        return state
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`; the predictor must have been given already."""
+        self.object_steps = state["object_steps"]
+        self.object_success = state["object_success"]
+        self.curriculum.load_state_dict(state["curriculum"])
+        if "model" not in state:
+            return
+        model = self.prepare()
+        model.load_training_state(state["model"])
+        _set_env_state(self.env, state["env"])
+        if self.curriculum_callback is not None:
+            self.curriculum_callback.load_state_dict(state["callback"])
+            _set_env_state(self.curriculum_callback.test_env, state["test_env"])
+        if "replay_buffer" in state:
+            assert model.replay_buffer is not None
+            model.replay_buffer.load_state_dict(state["replay_buffer"])
+
+    def save(self, folder: str | os.PathLike[str], replay_buffer: bool = True) -> None:
+        """Save everything to a folder: settings, predictor and training state.
+
+        Args:
+            folder: is created; files of an earlier save are replaced.
+            replay_buffer: False makes a small save that can act and train on, from empty replay.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        if self.predictor is not None and not (folder / "predictor").exists():
+            self.predictor.save(folder / "predictor")
+        save_tree(folder / "state.safetensors", self.state_dict(replay_buffer))
+        atomic_write(folder / "settings.json", json.dumps(self.settings, indent=2).encode())
+
+    @classmethod
+    def load(cls, folder: str | os.PathLike[str], report: Report | None = None) -> FollowObject:
+        """Restore what `save` wrote; training goes on exactly where it stopped.
+
+        Raises:
+            ValueError: the folder holds no save, or one that is damaged.
+        """
+        folder = Path(folder)
+        try:
+            settings = json.loads((folder / "settings.json").read_text())
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{folder} holds no saved FollowObject ({error})") from error
+        predictor = None
+        if (folder / "predictor").exists():
+            predictor = GoalPredictor.load(folder / "predictor", env_id=settings["env_id"])
+        run = cls(**settings, predictor=predictor, report=report)
+        run.load_state_dict(load_tree(folder / "state.safetensors"))
+        return run
+
+    def save_policy(self, path: str | os.PathLike[str]) -> None:
+        """Save the robot's actor alone: a small file that `load_actor` reads."""
+        if self.model is None:
+            raise ValueError("nothing has been learned yet: call learn() first")
+        save_actor(path, self.model.actor, self.env_id)
+
+    def close(self) -> None:
+        """Close all environments."""
+        self.env.close()
+        if self.curriculum_callback is not None:
+            self.curriculum_callback.test_env.close()
+
+    def _robot_env(self, purpose: str) -> VecEnv:
+        env = make_vec(
+            self.env_id,
+            self.settings["n_envs"],
+            self.settings["n_threads"],
+            reward_type=self.settings["reward_type"],
+        )
+        env.seed(stream_seed(self.seed, purpose))
+        return env
+
+    def _object_env(self, purpose: str) -> VecEnv:
+        env = make_vec(object_id(self.env_id), _OBJECT_COPIES, self.settings["n_threads"])
+        env.seed(stream_seed(self.seed, purpose))
+        return env
+
+
+def _env_state(env: VecEnv) -> Any:
+    """State of an environment that can tell it; others begin new episodes when resumed."""
+    return env.get_state() if hasattr(env, "get_state") else None
+
+
+def _set_env_state(env: VecEnv, state: Any) -> None:
+    if state is not None:
+        env.set_state(state)  # type: ignore[attr-defined]
+
+
+def _check_keywords(name: str, given: dict[str, Any], function: Callable[..., Any]) -> None:
+    known = [key for key in inspect.signature(function).parameters if key not in ("self", "cls")]
+    for key in given:
+        if key not in known:
+            nearest = difflib.get_close_matches(key, known, n=1)
+            hint = f"; did you mean {nearest[0]}?" if nearest else ""
+            raise ValueError(f"{name} has no setting {key!r}{hint}")
