@@ -1,0 +1,217 @@
+"""N copies of one scene stepped together in native threads, read into arrays once a step."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from .scene import N_SUBSTEPS, OBJECT, TUBE, Scene, weld_targets
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+MAX_DISPLACEMENT = 0.05  # metres a step at action 1
+
+
+class BatchedSimulation:
+    """N copies of a scene, moved through the mocap body that the scene's one weld pulls.
+
+    What an observation and the next action need is read right after stepping, as the last substep left
+    it: site and body poses then lag the joint positions by one substep, as in Gymnasium-Robotics.
+    Subclasses say what an action moves and what is observed.
+
+    Args:
+        scene: what to simulate.
+        n_envs: number of copies, at least 1.
+        n_threads: threads that step them; None takes one a processor, but no more than copies.
+
+    Raises:
+        ValueError: `n_envs` or `n_threads` is below 1.
+    """
+
+    action_size: int
+    observation_size: int
+
+    def __init__(self, scene: Scene, n_envs: int, n_threads: int | None = None) -> None:
+        if n_envs < 1:
+            raise ValueError(f"n_envs must be at least 1, not {n_envs}.")
+        if n_threads is not None and n_threads < 1:
+            raise ValueError(f"n_threads must be at least 1 or None, not {n_threads}.")
+        self.scene = scene
+        self.n_envs = n_envs
+        self.n_threads = min(n_threads or os.cpu_count() or 1, n_envs)
+        self._pool = ThreadPoolExecutor(self.n_threads - 1) if self.n_threads > 1 else None
+        model = scene.model
+        self.dt = model.opt.timestep * N_SUBSTEPS
+        self.data = [mujoco.MjData(model) for _ in range(n_envs)]
+        self.goals = np.zeros((n_envs, 3))
+        self._mocap, self._welded = weld_targets(model)
+        self._tube = int(model.body(TUBE).mocapid[0]) if scene.task.tube else None
+        self._object_qpos = int(model.joint(f"{OBJECT}:joint").qposadr[0])
+        self._object_qvel = int(model.joint(f"{OBJECT}:joint").dofadr[0])
+        self._object_site = int(model.site(OBJECT).id)
+
+        # What each copy shows after a step: name -> (n_envs, ...), and where it is read from.
+        self.read: dict[str, np.ndarray] = {}
+        self._views: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in range(n_envs)]
+        self._watch("welded_pos", [d.xpos[self._welded] for d in self.data])
+        self._watch("welded_quat", [d.xquat[self._welded] for d in self.data])
+        self._watch("object_pos", [d.site_xpos[self._object_site] for d in self.data])
+        self._watch("object_mat", [d.site_xmat[self._object_site] for d in self.data])
+        self._watch("qvel", [d.qvel for d in self.data])
+        self._watch("warnings", [d.warning.number for d in self.data])
+
+        self._target_pos = np.zeros((n_envs, 3))
+        self._target_quat = np.zeros((n_envs, 4))
+        self._mocap_pos = [d.mocap_pos[self._mocap] for d in self.data]
+        self._mocap_quat = [d.mocap_quat[self._mocap] for d in self.data]
+
+    # What a subclass says -------------------------------------------------------------------------
+
+    def control(self, actions: np.ndarray) -> None:
+        """Set what the next step pulls at, from clipped actions (n_envs, action_size)."""
+        raise NotImplementedError
+
+    def observe(self) -> tuple[np.ndarray, np.ndarray]:
+        """Observations (n_envs, observation_size) and achieved goals (n_envs, 3), newly made."""
+        raise NotImplementedError
+
+    def after_substeps(self, index: int) -> None:
+        """Called for each copy once it was stepped, before it is read."""
+
+    # Stepping -------------------------------------------------------------------------------------
+
+    def reset(self, index: int, rng: np.random.Generator) -> None:
+        """Start an episode in one copy: draw object and goal, forget the past."""
+        scene, data = self.scene, self.data[index]
+        start, goal = scene.task.sample(rng, scene.landmarks)
+        mujoco.mj_resetData(scene.model, data)
+        data.time = scene.time
+        data.qpos[:] = scene.qpos
+        data.qvel[:] = scene.qvel
+        data.qpos[self._object_qpos : self._object_qpos + 2] = start
+        if self._tube is not None:
+            data.mocap_pos[self._tube] = (goal[0], goal[1], self._table_top)
+        self.goals[index] = goal
+        mujoco.mj_forward(scene.model, data)
+        self.refresh(index)
+
+    def step(self, actions: np.ndarray) -> None:
+        """Move all copies on by one env step of 0.04 s.
+
+        Args:
+            actions: (n_envs, action_size), clipped to [-1, 1] here.
+
+        Raises:
+            RuntimeError: the simulation of a copy went out of bounds.
+        """
+        self.control(np.clip(actions, -1.0, 1.0))
+        todo = iter(range(self.n_envs))
+        if self._pool is None:
+            self._drain(todo)
+        else:
+            others = [self._pool.submit(self._drain, todo) for _ in range(self.n_threads - 1)]
+            self._drain(todo)
+            for other in others:
+                other.result()
+        if self.read["warnings"].any():
+            self._raise_diverged()
+
+    def refresh(self, index: int) -> None:
+        """Read one copy into the arrays of the batch."""
+        for row, view in self._views[index]:
+            row[...] = view
+
+    def close(self) -> None:
+        """Let the threads go."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    # Resuming -------------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """All that the next steps depend on, as arrays with one row a copy."""
+        size = mujoco.mj_stateSize(self.scene.model, STATE)
+        physics = np.empty((self.n_envs, size))
+        for row, data in zip(physics, self.data, strict=True):
+            mujoco.mj_getState(self.scene.model, data, row, STATE)
+        read = {f"read/{name}": values.copy() for name, values in self.read.items()}
+        return {"physics": physics, "goals": self.goals.copy(), **read}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from what `get_state` gave.
+
+        Raises:
+            ValueError: it comes from another number of copies or another scene.
+        """
+        size = mujoco.mj_stateSize(self.scene.model, STATE)
+        if state["physics"].shape != (self.n_envs, size):
+            raise ValueError(
+                f"The state has shape {state['physics'].shape}, but {self.n_envs} environments of "
+                f"{self.scene.task.name} need {(self.n_envs, size)}."
+            )
+        for row, data in zip(state["physics"], self.data, strict=True):
+            mujoco.mj_resetData(self.scene.model, data)
+            mujoco.mj_setState(self.scene.model, data, row, STATE)
+        self.goals[:] = state["goals"]
+        for name, values in self.read.items():
+            values[:] = state[f"read/{name}"]
+
+    # Inside ---------------------------------------------------------------------------------------
+
+    @property
+    def _table_top(self) -> float:
+        model, table = self.scene.model, self.scene.model.body("table0")
+        return float(table.pos[2] + model.geom_size[table.geomadr[0], 2])
+
+    def _watch(self, name: str, views: list[np.ndarray]) -> None:
+        self.read[name] = np.zeros((self.n_envs, *views[0].shape), dtype=views[0].dtype)
+        for index, view in enumerate(views):
+            self._views[index].append((self.read[name][index], view))
+
+    def _drain(self, todo: Iterator[int]) -> None:
+        # Threads share one range iterator: each takes the next copy, so uneven copies balance out.
+        model = self.scene.model
+        for index in todo:
+            data = self.data[index]
+            self._mocap_pos[index][...] = self._target_pos[index]
+            self._mocap_quat[index][...] = self._target_quat[index]
+            mujoco.mj_step(model, data, N_SUBSTEPS)
+            self.after_substeps(index)
+            self.refresh(index)
+
+    def _object_velocities(self) -> tuple[np.ndarray, np.ndarray]:
+        """Linear and angular velocity of the object in the world, per env step, each (n_envs, 3)."""
+        first = self._object_qvel
+        linear = self.read["qvel"][:, first : first + 3]
+        spin = self.read["qvel"][:, first + 3 : first + 6]
+        matrices = self.read["object_mat"].reshape(-1, 3, 3)
+        return linear * self.dt, np.einsum("nij,nj->ni", matrices, spin) * self.dt
+
+    def _raise_diverged(self) -> None:
+        index, kind = (int(i) for i in np.argwhere(self.read["warnings"])[0])
+        elapsed = round((self.data[index].time - self.scene.time) / self.dt)
+        raise RuntimeError(
+            f"The physics of environment {index} ({self.scene.task.name}) diverged around step {elapsed} "
+            f"({mujoco.mjtWarning(kind).name}); reset it, and check the actions for NaN."
+        )
+
+
+def euler_angles(matrices: np.ndarray) -> np.ndarray:
+    """Euler angles (n, 3) of rotation matrices (n, 3, 3), in Gymnasium-Robotics' convention.
+
+    About x, then y, then z of the fixed frame, negated; the first is 0 where the second is upright.
+    """
+    cosine = np.hypot(matrices[:, 2, 2], matrices[:, 1, 2])
+    regular = cosine > 4 * np.finfo(np.float64).eps
+    first = np.where(regular, -np.arctan2(matrices[:, 1, 2], matrices[:, 2, 2]), 0.0)
+    second = -np.arctan2(-matrices[:, 0, 2], cosine)
+    third = np.where(
+        regular,
+        -np.arctan2(matrices[:, 0, 1], matrices[:, 0, 0]),
+        -np.arctan2(-matrices[:, 1, 0], matrices[:, 1, 1]),
+    )
+    return np.stack([first, second, third], axis=1)

@@ -1,0 +1,291 @@
+"""The two faces of a batched simulation: a gymnasium.Env of one copy, an SB3 VecEnv of many."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from stable_baselines3.common.vec_env import VecEnv
+
+from .batch import BatchedSimulation
+from .picture import Picture
+from .scene import Scene
+from .tasks import SUCCESS_DISTANCE
+
+RewardType = Literal["sparse", "dense"]
+RENDER_MODES = ("human", "rgb_array")
+METADATA = {"render_modes": list(RENDER_MODES), "render_fps": 25}
+
+
+class _GoalFace:
+    """What both faces share: the simulation, its spaces, reward and success, pictures."""
+
+    simulation_type: type[BatchedSimulation]
+    simulation: BatchedSimulation
+    reward_type: RewardType
+
+    def _start(
+        self,
+        simulation: BatchedSimulation,
+        reward_type: RewardType,
+        render_mode: str | None,
+        show_regions: bool,
+    ) -> None:
+        if reward_type not in ("sparse", "dense"):
+            raise ValueError(f"reward_type must be 'sparse' or 'dense', not {reward_type!r}.")
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(
+                f"render_mode must be None, 'rgb_array' or 'human', not {render_mode!r}."
+            )
+        self.simulation = simulation
+        self.reward_type = reward_type
+        self.render_mode = render_mode
+        self._picture = Picture(simulation.scene, show_regions)
+        box: Callable[[int], spaces.Box] = lambda size: spaces.Box(
+            -np.inf, np.inf, (size,), np.float64
+        )
+        self.observation_space = spaces.Dict(
+            {
+                "observation": box(simulation.observation_size),
+                "achieved_goal": box(3),
+                "desired_goal": box(3),
+            }
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, (simulation.action_size,), np.float32)
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
+        """Rewards of achieved goals (..., 3) for desired ones (..., 3), shape (...); `info` is unused.
+
+        Sparse: 0 within 0.05 m, else -1. Dense: minus the distance in metres.
+        """
+        distance = _distance(achieved_goal, desired_goal)
+        if self.reward_type == "dense":
+            return -distance
+        return -(distance > SUCCESS_DISTANCE).astype(np.float32)
+
+    def is_success(self, achieved_goal: np.ndarray, desired_goal: np.ndarray) -> Any:
+        """Whether achieved goals (..., 3) lie within 0.05 m of desired ones, bool of shape (...)."""
+        return _distance(achieved_goal, desired_goal) <= SUCCESS_DISTANCE
+
+    def set_markers(self, points: np.ndarray) -> None:
+        """Points (n, 3) in metres that pictures show from now on, such as imagined goals."""
+        self._picture.set_markers(points)
+
+    def close(self) -> None:
+        """Let threads and windows go."""
+        self.simulation.close()
+        self._picture.close()
+
+
+class SingleEnv(_GoalFace, gym.Env):
+    """A batch of one as a gymnasium.Env; it never ends by itself, `gymnasium.make` truncates at T."""
+
+    metadata = METADATA
+    _arguments: dict[str, Any]
+
+    def _set_up(
+        self, scene: Scene, reward_type: RewardType, render_mode: str | None, show_regions: bool
+    ) -> None:
+        self._start(self.simulation_type(scene, 1), reward_type, render_mode, show_regions)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Draw object and goal and start an episode; `options` is unused."""
+        super().reset(seed=seed)
+        self.simulation.reset(0, self.np_random)
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), {}
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Move on by 0.04 s; the action (action_size,) is clipped to [-1, 1].
+
+        Raises:
+            ValueError: the action has another shape.
+            RuntimeError: the simulation went out of bounds.
+        """
+        action = np.asarray(action)
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"The action has shape {action.shape}, not {self.action_space.shape}.")
+        self.simulation.step(action[None])
+        obs = self._observation()
+        if self.render_mode == "human":
+            self.render()
+        achieved, desired = obs["achieved_goal"], obs["desired_goal"]
+        info = {"is_success": bool(self.is_success(achieved, desired))}
+        return obs, float(self.compute_reward(achieved, desired, info)), False, False, info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """A picture (480, 480, 3) with "rgb_array"; None, and a window, with "human"."""
+        if self.render_mode is None:
+            gym.logger.warn("render() needs render_mode='rgb_array' or 'human'.")
+            return None
+        return self._picture.draw(self.simulation, 0, self.render_mode)
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        observation, achieved = self.simulation.observe()
+        return {
+            "observation": observation[0],
+            "achieved_goal": achieved[0],
+            "desired_goal": self.simulation.goals[0].copy(),
+        }
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {
+            "arguments": self._arguments,
+            "simulation": self.simulation.get_state(),
+            "np_random": self._np_random,
+            "spec": self.spec,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state["arguments"])  # type: ignore[misc]
+        self.simulation.set_state(state["simulation"])
+        self._np_random = state["np_random"]
+        self.spec = state["spec"]
+
+
+class BatchVecEnv(_GoalFace, VecEnv):
+    """A batch of N as an SB3 VecEnv that resets by itself and truncates at the task's T."""
+
+    metadata = METADATA
+
+    def __init__(
+        self,
+        scene: Scene,
+        n_envs: int,
+        n_threads: int | None,
+        *,
+        seed: int | None,
+        reward_type: RewardType,
+        render_mode: str | None,
+        show_regions: bool,
+    ) -> None:
+        simulation = self.simulation_type(scene, n_envs, n_threads)
+        self._start(simulation, reward_type, render_mode, show_regions)
+        super().__init__(n_envs, self.observation_space, self.action_space)
+        self.horizon = scene.task.horizon
+        self._elapsed = np.zeros(n_envs, dtype=np.int64)
+        self._generators = [seeding.np_random()[0] for _ in range(n_envs)]
+        self._actions = np.zeros((n_envs, simulation.action_size))
+        if seed is not None:
+            self.seed(seed)
+
+    def reset(self) -> dict[str, np.ndarray]:
+        """Start an episode in every copy; seeds set by `seed()` count from here."""
+        for index, seed in enumerate(self._seeds):
+            if seed is not None:
+                self._generators[index] = seeding.np_random(seed)[0]
+            self.simulation.reset(index, self._generators[index])
+        self._elapsed[:] = 0
+        self._reset_seeds()
+        self._reset_options()
+        return self._observations()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions (n_envs, action_size) for `step_wait`."""
+        self._actions = np.asarray(actions)
+
+    def step_wait(
+        self,
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Move all copies on by 0.04 s; those at T start anew and tell their last observation.
+
+        Raises:
+            ValueError: the actions have another shape.
+            RuntimeError: the simulation of a copy went out of bounds.
+        """
+        expected = (self.num_envs, self.simulation.action_size)
+        if self._actions.shape != expected:
+            raise ValueError(f"The actions have shape {self._actions.shape}, not {expected}.")
+        self.simulation.step(self._actions)
+        obs = self._observations()
+        achieved, desired = obs["achieved_goal"], obs["desired_goal"]
+        rewards = self.compute_reward(achieved, desired, None).astype(np.float32)
+        self._elapsed += 1
+        dones = self._elapsed >= self.horizon
+        infos: list[dict[str, Any]] = [
+            {"is_success": success, "TimeLimit.truncated": done}
+            for success, done in zip(
+                self.is_success(achieved, desired).tolist(), dones.tolist(), strict=True
+            )
+        ]
+        if dones.any():
+            for index in np.flatnonzero(dones):
+                infos[index]["terminal_observation"] = {
+                    key: values[index].copy() for key, values in obs.items()
+                }
+                self.simulation.reset(index, self._generators[index])
+            self._elapsed[dones] = 0
+            obs = self._observations()
+        if self.render_mode == "human":
+            self.render()
+        return obs, rewards, dones, infos
+
+    def get_state(self) -> dict[str, Any]:
+        """All that a resumed run needs to go on as if never stopped, generators included."""
+        return {
+            **self.simulation.get_state(),
+            "elapsed": self._elapsed.copy(),
+            "generators": [generator.bit_generator.state for generator in self._generators],
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from what `get_state` gave.
+
+        Raises:
+            ValueError: it comes from another number of copies or another task.
+        """
+        self.simulation.set_state(state)
+        self._elapsed[:] = state["elapsed"]
+        for generator, saved in zip(self._generators, state["generators"], strict=True):
+            generator.bit_generator.state = saved
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """A picture (480, 480, 3) of every copy."""
+        return [
+            self._picture.draw(self.simulation, index, "rgb_array")
+            for index in range(self.num_envs)
+        ]
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        """All copies tiled with "rgb_array"; the first copy in a window with "human"."""
+        if (mode or self.render_mode) == "human":
+            return self._picture.draw(self.simulation, 0, "human")
+        return super().render(mode)
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The attribute, which all copies share, once for each index."""
+        value = getattr(self, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute, which all copies share."""
+        setattr(self, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method, once for each index."""
+        method = getattr(self, method_name)
+        return [method(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
+        """No copy is wrapped."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _observations(self) -> dict[str, np.ndarray]:
+        observation, achieved = self.simulation.observe()
+        desired = self.simulation.goals.copy()
+        return {"observation": observation, "achieved_goal": achieved, "desired_goal": desired}
+
+
+def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(np.asarray(first) - np.asarray(second), axis=-1))

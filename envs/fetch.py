@@ -1,0 +1,150 @@
+"""The robot's tasks: one batched simulation behind a gymnasium.Env and an SB3 VecEnv."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles
+from .faces import BatchVecEnv, RewardType, SingleEnv
+from .ids import task_of
+from .scene import FINGER_JOINTS, GRIP_SITE, Scene, fetch_scene
+from .tasks import Task, find_task
+
+# Added to the gripper's own quaternion each step, which turns it to point down.
+_DOWNWARD = np.array([1.0, 0.0, 1.0, 0.0])
+
+
+class FetchSimulation(BatchedSimulation):
+    """The Fetch robot: actions move its gripper (3) and its fingers (1), observations are v4's 25."""
+
+    action_size = 4
+    observation_size = 25
+
+    def __init__(self, scene: Scene, n_envs: int, n_threads: int | None = None) -> None:
+        super().__init__(scene, n_envs, n_threads)
+        model = scene.model
+        fingers = [model.joint(name) for name in FINGER_JOINTS]
+        self._finger_qpos = np.array([joint.qposadr[0] for joint in fingers])
+        self._finger_qvel = np.array([joint.dofadr[0] for joint in fingers])
+        self._driven_qpos = model.jnt_qposadr[model.actuator_trnid[:, 0]]
+        self._grip_site = int(model.site(GRIP_SITE).id)
+        self._controls = [d.ctrl for d in self.data]
+        self.read["grip_jacobian"] = np.zeros((n_envs, 3, model.nv))
+        self._watch("qpos", [d.qpos for d in self.data])
+        self._watch("grip_pos", [d.site_xpos[self._grip_site] for d in self.data])
+
+    def control(self, actions: np.ndarray) -> None:
+        self._target_pos[:] = self.read["welded_pos"] + actions[:, :3] * MAX_DISPLACEMENT
+        self._target_quat[:] = self.read["welded_quat"] + _DOWNWARD
+        if not self.scene.task.blocked_gripper:
+            targets = self.read["qpos"][:, self._driven_qpos] + actions[:, 3:]
+            for control, target in zip(self._controls, targets, strict=True):
+                control[:] = target
+
+    def after_substeps(self, index: int) -> None:
+        data = self.data[index]
+        if self.scene.task.blocked_gripper:
+            data.qpos[self._finger_qpos] = 0.0
+            mujoco.mj_forward(self.scene.model, data)
+
+    def refresh(self, index: int) -> None:
+        super().refresh(index)
+        jacobian = self.read["grip_jacobian"][index]
+        mujoco.mj_jacSite(self.scene.model, self.data[index], jacobian, None, self._grip_site)
+
+    def observe(self) -> tuple[np.ndarray, np.ndarray]:
+        read = self.read
+        linear, angular = self._object_velocities()
+        grip_velocity = np.einsum("nij,nj->ni", read["grip_jacobian"], read["qvel"])
+        grip_velocity *= self.dt
+        parts = (
+            read["grip_pos"],
+            read["object_pos"],
+            read["object_pos"] - read["grip_pos"],
+            read["qpos"][:, self._finger_qpos],
+            euler_angles(read["object_mat"].reshape(-1, 3, 3)),
+            linear - grip_velocity,
+            angular,
+            grip_velocity,
+            read["qvel"][:, self._finger_qvel] * self.dt,
+        )
+        return np.concatenate(parts, axis=1), read["object_pos"].copy()
+
+
+class FetchEnv(SingleEnv):
+    """One robot task as a gymnasium.Env with Dict observations (paper, section 4).
+
+    Args:
+        task: key in `TASKS`, or a row of one's own.
+        reward_type: "sparse" (0 within 0.05 m of the goal, else -1) or "dense" (minus the distance, m).
+        render_mode: None, "rgb_array" or "human".
+        collision: "reachable" leaves out pairs that do not matter, "full" tests all.
+        show_regions: draw where start and goal come from.
+
+    Raises:
+        ValueError: an unknown task, reward, render mode or collision.
+    """
+
+    simulation_type = FetchSimulation
+
+    def __init__(
+        self,
+        task: str | Task,
+        *,
+        reward_type: RewardType = "sparse",
+        render_mode: str | None = None,
+        collision: str = "reachable",
+        show_regions: bool = False,
+    ) -> None:
+        self._arguments: dict[str, Any] = {
+            "task": task,
+            "reward_type": reward_type,
+            "render_mode": render_mode,
+            "collision": collision,
+            "show_regions": show_regions,
+        }
+        scene = fetch_scene(find_task(task), collision)
+        self._set_up(scene, reward_type, render_mode, show_regions)
+
+
+class FetchVecEnv(BatchVecEnv):
+    """N copies of a robot task as one SB3 VecEnv: native threads, vectorised observations.
+
+    Args:
+        env_id: a registered id such as "FollowObject/PnPShelf-v0", or a row of one's own.
+        n_envs: number of copies, at least 1.
+        n_threads: threads that step them; None takes one a processor.
+        seed: copy i draws what `FetchEnv.reset(seed=seed + i)` draws; None is random.
+        reward_type, collision, render_mode, show_regions: as in `FetchEnv`.
+
+    Raises:
+        ValueError: an unknown id or option, or a number below 1.
+    """
+
+    simulation_type = FetchSimulation
+
+    def __init__(
+        self,
+        env_id: str | Task,
+        n_envs: int,
+        n_threads: int | None = None,
+        *,
+        seed: int | None = None,
+        reward_type: RewardType = "sparse",
+        collision: str = "reachable",
+        render_mode: str | None = None,
+        show_regions: bool = False,
+    ) -> None:
+        scene = fetch_scene(task_of(env_id, alone=False), collision)
+        super().__init__(
+            scene,
+            n_envs,
+            n_threads,
+            seed=seed,
+            reward_type=reward_type,
+            render_mode=render_mode,
+            show_regions=show_regions,
+        )

@@ -1,0 +1,103 @@
+"""The object alone, moved by a mocap body it is welded to (section 3.1 of the paper)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles
+from .faces import BatchVecEnv, RewardType, SingleEnv
+from .ids import task_of
+from .scene import object_scene
+from .tasks import Task, find_task
+
+
+class ObjectSimulation(BatchedSimulation):
+    """Actions move the mocap body off the object's pose: 3 for position, 4 for its quaternion."""
+
+    action_size = 7
+    observation_size = 12
+
+    def control(self, actions: np.ndarray) -> None:
+        self._target_pos[:] = self.read["welded_pos"] + actions[:, :3] * MAX_DISPLACEMENT
+        self._target_quat[:] = self.read["welded_quat"] + actions[:, 3:] * MAX_DISPLACEMENT
+
+    def observe(self) -> tuple[np.ndarray, np.ndarray]:
+        position = self.read["object_pos"]
+        angles = euler_angles(self.read["object_mat"].reshape(-1, 3, 3))
+        parts = (position, angles, *self._object_velocities())
+        return np.concatenate(parts, axis=1), position.copy()
+
+
+class ObjectEnv(SingleEnv):
+    """One task's object alone as a gymnasium.Env; goals, reward and T are the robot's.
+
+    The observation (12,) is position (m), Euler angles (rad), linear and angular velocity (per env
+    step); the action (7,) in [-1, 1] moves the object's position and quaternion by 0.05 times it.
+
+    Args:
+        task: key in `TASKS`, or a row of one's own.
+        reward_type: "sparse" (0 within 0.05 m of the goal, else -1) or "dense" (minus the distance, m).
+        render_mode: None, "rgb_array" or "human".
+        show_regions: draw where start and goal come from.
+
+    Raises:
+        ValueError: an unknown task, reward or render mode.
+    """
+
+    simulation_type = ObjectSimulation
+
+    def __init__(
+        self,
+        task: str | Task,
+        *,
+        reward_type: RewardType = "sparse",
+        render_mode: str | None = None,
+        show_regions: bool = False,
+    ) -> None:
+        self._arguments: dict[str, Any] = {
+            "task": task,
+            "reward_type": reward_type,
+            "render_mode": render_mode,
+            "show_regions": show_regions,
+        }
+        self._set_up(object_scene(find_task(task)), reward_type, render_mode, show_regions)
+
+
+class ObjectVecEnv(BatchVecEnv):
+    """N copies of a task's object alone as one SB3 VecEnv.
+
+    Args:
+        env_id: a registered id such as "FollowObject/PnPShelfObject-v0", or a row of one's own.
+        n_envs: number of copies, at least 1.
+        n_threads: threads that step them; None takes one a processor.
+        seed: copy i draws what `ObjectEnv.reset(seed=seed + i)` draws; None is random.
+        reward_type, render_mode, show_regions: as in `ObjectEnv`.
+
+    Raises:
+        ValueError: an unknown id or option, or a number below 1.
+    """
+
+    simulation_type = ObjectSimulation
+
+    def __init__(
+        self,
+        env_id: str | Task,
+        n_envs: int,
+        n_threads: int | None = None,
+        *,
+        seed: int | None = None,
+        reward_type: RewardType = "sparse",
+        render_mode: str | None = None,
+        show_regions: bool = False,
+    ) -> None:
+        super().__init__(
+            object_scene(task_of(env_id, alone=True)),
+            n_envs,
+            n_threads,
+            seed=seed,
+            reward_type=reward_type,
+            render_mode=render_mode,
+            show_regions=show_regions,
+        )

@@ -1,0 +1,294 @@
+"""Scenes composed with MjSpec: robot, table, obstacles and object, and the object alone.
+
+The robot, table and object are the Fetch assets that gymnasium-robotics installs; only their place on
+disk is looked up, so that package's own checks of the mujoco version never run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from .tasks import Box, Landmarks, Task
+
+N_SUBSTEPS = 20  # of 0.002 s each: one env step is 0.04 s
+OBJECT = "object0"  # body, site and geom
+TABLE = "table0"
+TUBE = "tube"
+GRIP_SITE = "robot0:grip"
+# Right, then left, as in the observation.
+FINGER_JOINTS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
+
+# Where the robot and the object stand before the arm is moved into place.
+_SLIDES = {"robot0:slide0": 0.405, "robot0:slide1": 0.48, "robot0:slide2": 0.0}
+_OBJECT_QPOS = (1.25, 0.53, 0.4, 1.0, 0.0, 0.0, 0.0)
+_GRIPPER_EXTRA_HEIGHT = 0.2
+_MOCAP_OFFSET = np.array([-0.498, 0.005, -0.431 + _GRIPPER_EXTRA_HEIGHT])
+_MOCAP_QUAT = (1.0, 0.0, 1.0, 0.0)
+_SETUP_STEPS = 10
+# Inside the floor, where it is neither seen nor touched, until a reset puts it at the goal.
+_TUBE_STORE = (1.3, 0.75, -0.5)
+
+COLLISIONS = ("reachable", "full")
+# collision="reachable": two geoms are tested when one's bit is in the other's mask. Kept is every pair of a
+# robot part with floor, table, obstacles, tube or object, and of the arm with the trunk (the shoulder
+# rubs against the torso when the gripper is far out, so leaving that out changes where the gripper
+# goes). Left out are links of the arm against each other and the three parts named last, whose geoms
+# leave the physics model.
+_FLOOR, _STANDING, _OBJECT_BIT, _TRUNK, _UPPER_ARM = 1, 2, 4, 8, 16
+_WORLD = _FLOOR | _STANDING | _OBJECT_BIT
+_ROBOT_BITS = {
+    "base_link": (_TRUNK, _WORLD),
+    "torso_lift_link": (_TRUNK, _WORLD),
+    "head_pan_link": (_TRUNK, _WORLD),
+    "head_tilt_link": (_TRUNK, _WORLD),
+    "shoulder_pan_link": (0, _WORLD),
+    "shoulder_lift_link": (_UPPER_ARM, _WORLD | _TRUNK),
+    "upperarm_roll_link": (_UPPER_ARM, _WORLD | _TRUNK),
+    "elbow_flex_link": (0, _WORLD | _TRUNK),
+    "forearm_roll_link": (0, _WORLD | _TRUNK),
+    "wrist_flex_link": (0, _WORLD | _TRUNK),
+    "wrist_roll_link": (0, _WORLD | _TRUNK),
+    "gripper_link": (0, _WORLD | _TRUNK | _UPPER_ARM),
+    "r_gripper_finger_link": (0, _WORLD | _TRUNK | _UPPER_ARM),
+    "l_gripper_finger_link": (0, _WORLD | _TRUNK | _UPPER_ARM),
+}
+_NEVER_TOUCHED = ("estop_link", "laser_link", "torso_fixed_link")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A compiled scene and what a simulation of it starts from; shared by all its copies.
+
+    Args:
+        task: the row it was built from.
+        alone: whether the object is alone (no robot).
+        model: the physics, not to be written to.
+        qpos: state every episode starts from but for the object's place, (nq,).
+        qvel: likewise, (nv,).
+        time: simulated time at the start of an episode, in seconds.
+        landmarks: points that the task's samplers refer to.
+    """
+
+    task: Task
+    alone: bool
+    model: mujoco.MjModel
+    qpos: np.ndarray
+    qvel: np.ndarray
+    time: float
+    landmarks: Landmarks
+
+
+@lru_cache(maxsize=32)
+def fetch_scene(task: Task, collision: str = "reachable") -> Scene:
+    """The robot's scene of a task, set up: arm moved into place, object at rest.
+
+    Args:
+        task: the row to build.
+        collision: "full" tests every pair of geoms, "reachable" those that can matter.
+
+    Raises:
+        ValueError: `collision` is neither of the two.
+    """
+    if collision not in COLLISIONS:
+        raise ValueError(f"collision must be 'reachable' or 'full', not {collision!r}.")
+    spec = fetch_spec(task)
+    if collision == "reachable":
+        _leave_out_unreachable(spec)
+    model = strip_visuals(spec).compile()
+    return _set_up(task, model)
+
+
+@lru_cache(maxsize=32)
+def object_scene(task: Task) -> Scene:
+    """The same task with the object alone; episodes start as those of the robot do."""
+    robot = fetch_scene(task)
+    model = strip_visuals(object_only(fetch_spec(task), OBJECT)).compile()
+    start = robot.model.joint(f"{OBJECT}:joint").qposadr[0]
+    qpos = robot.qpos[start : start + 7].copy()
+    return Scene(task, True, model, qpos, np.zeros(model.nv), 0.0, robot.landmarks)
+
+
+def fetch_spec(task: Task) -> mujoco.MjSpec:
+    """The robot's scene of a task with everything in it, for physics and for pictures."""
+    # With blocked fingers the original has no actuators; both files are the same otherwise.
+    file = "push.xml" if task.blocked_gripper else "pick_and_place.xml"
+    spec = mujoco.MjSpec.from_file(str(_assets() / "fetch" / file))
+    table = _child(spec.worldbody.bodies, TABLE)
+    _add_boxes(table, task.obstacles)
+    if task.tube:
+        tube = spec.worldbody.add_body(name=TUBE, mocap=True, pos=_TUBE_STORE)
+        _add_boxes(tube, task.tube)
+    return spec
+
+
+def object_only(spec: mujoco.MjSpec, body_name: str) -> mujoco.MjSpec:
+    """A scene with one free body and without the robot: the body is welded to a new mocap body.
+
+    What stands still stays, other free bodies too; articulated bodies and the mocap bodies that pull
+    them go, and with them actuators, sensors, tendons, equalities and keyframes (section 3.1).
+
+    Args:
+        spec: any scene; it is not changed.
+        body_name: the free body to keep.
+
+    Returns:
+        A new spec whose mocap body is called `<body_name>:mocap`.
+
+    Raises:
+        ValueError: there is no such body or it has no free joint.
+    """
+    spec = spec.copy()
+    names = [body.name for body in spec.bodies]
+    if body_name not in names:
+        known = ", ".join(name for name in names if name)
+        raise ValueError(f"The scene has no body {body_name!r}; its bodies are {known}.")
+    body = _child(spec.bodies, body_name)
+    if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints):
+        raise ValueError(f"Body {body_name!r} has no free joint, so it cannot move by itself.")
+
+    welded = {name for eq in spec.equalities for name in (eq.name1, eq.name2)}
+    gone = [
+        child
+        for child in spec.worldbody.bodies
+        if child.name != body_name
+        and (_articulated(child) or (child.mocap and child.name in welded))
+    ]
+    gone_names = {name for child in gone for name in _names_below(child)}
+    for group in (spec.keys, spec.sensors, spec.actuators, spec.tendons, spec.equalities):
+        _delete(spec, group)
+    _delete(spec, (x for x in spec.excludes if {x.bodyname1, x.bodyname2} & gone_names))
+    _delete(spec, (x for x in spec.pairs if {x.geomname1, x.geomname2} & gone_names))
+    _delete(spec, gone)
+
+    mocap = f"{body_name}:mocap"
+    spec.worldbody.add_body(name=mocap, mocap=True, pos=body.pos, quat=body.quat)
+    weld = spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1=mocap,
+        name2=body_name,
+        solref=[0.02, 1.0],
+        solimp=[0.9, 0.95, 0.001, 0.5, 2.0],
+    )
+    weld.data[:] = [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]  # same pose, torque scale 1
+    return spec
+
+
+def strip_visuals(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Drop from a spec what physics never reads: cameras, lights, geoms that touch nothing."""
+    _delete(spec, spec.cameras)
+    _delete(spec, spec.lights)
+    _delete(spec, (geom for geom in spec.geoms if not geom.contype and not geom.conaffinity))
+    return spec
+
+
+def physics_digest(task: Task) -> str:
+    """A short hash of what decides the object's motion: its scene, its samplers, the substeps.
+
+    Numbers of the compiled scene are hashed and not its XML, whose wording changes between releases of
+    mujoco.
+    """
+    model = object_scene(task).model
+    fields = (
+        "body_pos body_mass body_inertia geom_type geom_pos geom_size geom_friction geom_condim "
+        "geom_margin geom_solref geom_solimp dof_damping eq_data eq_solref eq_solimp"
+    )
+    parts = [repr(task), str(N_SUBSTEPS), f"{model.opt.timestep:.9g}", str(model.opt.gravity)]
+    for field in fields.split():
+        values = np.asarray(getattr(model, field), dtype=np.float64).ravel()
+        parts.append(field + " ".join(f"{value:.9g}" for value in values))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+
+
+def weld_targets(model: mujoco.MjModel) -> tuple[int, int]:
+    """The mocap id and the body id of a scene's one weld."""
+    first, second = int(model.eq_obj1id[0]), int(model.eq_obj2id[0])
+    if model.body_mocapid[first] < 0:
+        first, second = second, first
+    return int(model.body_mocapid[first]), second
+
+
+def _set_up(task: Task, model: mujoco.MjModel) -> Scene:
+    data = mujoco.MjData(model)
+    for name, value in _SLIDES.items():
+        data.joint(name).qpos = value
+    data.joint(f"{OBJECT}:joint").qpos = _OBJECT_QPOS
+    # The weld holds the gripper in the mocap's own pose; its quaternion's vector part stays compiled.
+    model.eq_data[0, :7] = [0, 0, 0, 0, 0, 0, 1]
+    mujoco.mj_forward(model, data)
+    mocap, _ = weld_targets(model)
+    data.mocap_pos[mocap] = data.site(GRIP_SITE).xpos + _MOCAP_OFFSET
+    data.mocap_quat[mocap] = _MOCAP_QUAT
+    mujoco.mj_step(model, data, nstep=_SETUP_STEPS * N_SUBSTEPS)
+    gripper, table = data.site(GRIP_SITE).xpos, data.body(TABLE).xpos
+    landmarks = Landmarks(
+        gripper=(float(gripper[0]), float(gripper[1]), float(gripper[2])),
+        table=(float(table[0]), float(table[1]), float(table[2])),
+        rest_height=float(data.site(OBJECT).xpos[2]),
+    )
+    return Scene(task, False, model, data.qpos.copy(), data.qvel.copy(), data.time, landmarks)
+
+
+def _leave_out_unreachable(spec: mujoco.MjSpec) -> None:
+    for geom in spec.geoms:
+        part = geom.name.removeprefix("robot0:")
+        if part in _ROBOT_BITS:
+            geom.contype, geom.conaffinity = _ROBOT_BITS[part]
+        elif part in _NEVER_TOUCHED:
+            geom.contype, geom.conaffinity = 0, 0
+        elif part == OBJECT:
+            geom.contype, geom.conaffinity = _OBJECT_BIT, _FLOOR | _STANDING
+        elif part == "floor0":
+            geom.contype, geom.conaffinity = _FLOOR, 0
+        elif geom.parent.name in (TABLE, TUBE):
+            geom.contype, geom.conaffinity = _STANDING, 0
+
+
+@lru_cache(maxsize=1)
+def _assets() -> Path:
+    found = importlib.util.find_spec("gymnasium_robotics")
+    if found is None or found.origin is None:
+        raise ModuleNotFoundError("The Fetch assets are missing: pip install gymnasium-robotics.")
+    return Path(found.origin).parent / "envs" / "assets"
+
+
+def _add_boxes(body: Any, boxes: Iterable[Box]) -> None:
+    for box in boxes:
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=box.centre,
+            size=box.half_size,
+            friction=box.friction,
+            condim=box.condim,
+            rgba=(0.45, 0.55, 0.70, 1.0),
+        )
+
+
+def _child(bodies: Iterable[Any], name: str) -> Any:
+    return next(body for body in bodies if body.name == name)
+
+
+def _articulated(body: Any) -> bool:
+    """Whether a body or one below it has a joint other than a free one."""
+    hinged = any(joint.type != mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
+    return hinged or any(_articulated(child) for child in body.bodies)
+
+
+def _names_below(body: Any) -> set[str]:
+    """Names of a body, its geoms, and all below it."""
+    names = {body.name, *(geom.name for geom in body.geoms)}
+    return names.union(*(_names_below(child) for child in body.bodies))
+
+
+def _delete(spec: mujoco.MjSpec, elements: Iterable[Any]) -> None:
+    for element in list(elements):
+        spec.delete(element)
