@@ -20,7 +20,9 @@ from .files import atomic_write
 
 POSITION = 3  # coordinates of an object position
 INPUTS = 2 * POSITION + 1  # o_1, g, k
-SMALLEST_STD = 1e-3  # metres: keeps a coordinate that never varies from being blown up
+# Metres. The start's height is the same in all paths up to the solver's noise; divided by that
+# noise, half a millimetre in the robot's scene would be an input that the network has never seen.
+SMALLEST_STD = 1e-2
 
 TENSORS_FILE = "predictor.safetensors"
 FACTS_FILE = "predictor.json"
@@ -294,7 +296,7 @@ def _train(
     generator: torch.Generator,
     progress: Progress | None,
 ) -> None:
-    optimiser = torch.optim.Adam(network.parameters(), lr=learning_rate, fused=True)
+    optimiser = torch.optim.Adam(network.parameters(), lr=learning_rate)
     for epoch in range(1, epochs + 1):
         order = torch.randperm(len(inputs), generator=generator)
         total = torch.zeros(())
