@@ -7,7 +7,7 @@ Stable-Baselines3 is itself being imported, so the classes are loaded when first
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .ids import IDS, make_vec, physics_id, register_envs
+from .ids import IDS, make_vec, object_id, physics_id, register_envs
 from .tasks import TASKS, Box, Height, Region, Task
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ __all__ = [
     "Region",
     "Task",
     "make_vec",
+    "object_id",
     "physics_id",
     "register_envs",
     *_HOME,

@@ -56,6 +56,16 @@ def task_of(env_id: str | Task, *, alone: bool) -> Task:
     return task
 
 
+def object_id(env_id: str) -> str:
+    """The id of the object alone in a task of ours, given the robot's or its own.
+
+    Raises:
+        ValueError: it is not one of ours.
+    """
+    task, _ = lookup(env_id)
+    return f"FollowObject/{task.name}Object-v0"
+
+
 def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: Any) -> Any:
     """A VecEnv of n copies: batched and threaded for our ids, SB3's DummyVecEnv for others.
 
