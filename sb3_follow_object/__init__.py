@@ -1,16 +1,15 @@
 """Follow the Object for Stable-Baselines3: imagined goals and a curriculum over them.
 
 Importing the package registers the gymnasium ids ``FollowObject/...``. The learning classes are
-loaded when first used, so that making an environment does not import torch.
+loaded when first used: whoever wants the environments alone does not wait for them.
 """
 
-from importlib import import_module, util
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if util.find_spec(f"{__name__}.envs") is not None:
-    from .envs import register_envs
+from .envs import register_envs
 
-    register_envs()
+register_envs()
 
 __version__ = "0.1.0"
 

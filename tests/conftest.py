@@ -10,18 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tree import PACKAGES, ROOT, run
 
 # Small networks and small scenes: more threads only make the test processes wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 if sys.platform == "linux":
     os.environ.setdefault("MUJOCO_GL", "egl")
-
-ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = {
-    "sb3_follow_object": ROOT / "sb3_follow_object",
-    "sb3_follow_object/envs": ROOT / "envs",
-    "sb3_follow_object/zoo_configs": ROOT / "zoo_configs",
-}
 
 DRAW_ONE_PICTURE = """
 import mujoco
@@ -80,12 +74,3 @@ def bare_python(wheel: Path) -> Callable[..., Path]:
         return python
 
     return make
-
-
-def run(command: list[str], **options: object) -> str:
-    """Runs a command; its output becomes the failure's message."""
-    done = subprocess.run(  # type: ignore[call-overload]
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False, **options
-    )
-    assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}"
-    return str(done.stdout)

@@ -5,8 +5,8 @@ from importlib.metadata import requires, version
 from pathlib import Path
 
 import pytest
-from conftest import run
 from packaging.requirements import Requirement
+from tree import run
 
 MUJOCO = next(
     requirement
