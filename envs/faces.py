@@ -8,6 +8,7 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -177,6 +178,13 @@ class BatchVecEnv(_GoalFace, VecEnv):
         self._actions = np.zeros((n_envs, simulation.action_size))
         if seed is not None:
             self.seed(seed)
+
+    @property
+    def spec(self) -> EnvSpec:
+        """Gymnasium's spec of each copy, which says how long its episodes are."""
+        scene = self.simulation.scene
+        name = f"{scene.task.name}{'Object' if scene.alone else ''}"
+        return EnvSpec(f"FollowObject/{name}-v0", max_episode_steps=scene.task.horizon)
 
     def reset(self) -> dict[str, np.ndarray]:
         """Start an episode in every copy; seeds set by `seed()` count from here."""
