@@ -19,8 +19,8 @@ MAX_DISPLACEMENT = 0.05  # metres a step at action 1
 class BatchedSimulation:
     """N copies of a scene, moved through the mocap body that the scene's one weld pulls.
 
-    What an observation and the next action need is read right after stepping, as the last substep left
-    it: site and body poses then lag the joint positions by one substep, as in Gymnasium-Robotics.
+    What an observation and the next action need is read right after stepping, as the last substep
+    left it: poses then lag the joint positions by one substep, as in Gymnasium-Robotics.
     Subclasses say what an action moves and what is observed.
 
     Args:
@@ -64,6 +64,7 @@ class BatchedSimulation:
         self._watch("qvel", [d.qvel for d in self.data])
         self._watch("warnings", [d.warning.number for d in self.data])
 
+        self.steps = np.zeros(n_envs, dtype=np.int64)
         self._target_pos = np.zeros((n_envs, 3))
         self._target_quat = np.zeros((n_envs, 4))
         self._mocap_pos = [d.mocap_pos[self._mocap] for d in self.data]
@@ -96,6 +97,7 @@ class BatchedSimulation:
         if self._tube is not None:
             data.mocap_pos[self._tube] = (goal[0], goal[1], self._table_top)
         self.goals[index] = goal
+        self.steps[index] = 0
         mujoco.mj_forward(scene.model, data)
         self.refresh(index)
 
@@ -109,6 +111,7 @@ class BatchedSimulation:
             RuntimeError: the simulation of a copy went out of bounds.
         """
         self.control(np.clip(actions, -1.0, 1.0))
+        self.steps += 1
         todo = iter(range(self.n_envs))
         if self._pool is None:
             self._drain(todo)
@@ -139,7 +142,7 @@ class BatchedSimulation:
         for row, data in zip(physics, self.data, strict=True):
             mujoco.mj_getState(self.scene.model, data, row, STATE)
         read = {f"read/{name}": values.copy() for name, values in self.read.items()}
-        return {"physics": physics, "goals": self.goals.copy(), **read}
+        return {"physics": physics, "goals": self.goals.copy(), "steps": self.steps.copy(), **read}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from what `get_state` gave.
@@ -157,6 +160,7 @@ class BatchedSimulation:
             mujoco.mj_resetData(self.scene.model, data)
             mujoco.mj_setState(self.scene.model, data, row, STATE)
         self.goals[:] = state["goals"]
+        self.steps[:] = state["steps"]
         for name, values in self.read.items():
             values[:] = state[f"read/{name}"]
 
@@ -184,20 +188,24 @@ class BatchedSimulation:
             self.refresh(index)
 
     def _object_velocities(self) -> tuple[np.ndarray, np.ndarray]:
-        """Linear and angular velocity of the object in the world, per env step, each (n_envs, 3)."""
+        """The object's linear and angular velocity, world frame, per env step, (n_envs, 3) each."""
         first = self._object_qvel
         linear = self.read["qvel"][:, first : first + 3]
         spin = self.read["qvel"][:, first + 3 : first + 6]
         matrices = self.read["object_mat"].reshape(-1, 3, 3)
-        return linear * self.dt, np.einsum("nij,nj->ni", matrices, spin) * self.dt
+        return linear * self.dt, rotate(matrices, spin) * self.dt
 
     def _raise_diverged(self) -> None:
         index, kind = (int(i) for i in np.argwhere(self.read["warnings"])[0])
-        elapsed = round((self.data[index].time - self.scene.time) / self.dt)
         raise RuntimeError(
-            f"The physics of environment {index} ({self.scene.task.name}) diverged around step {elapsed} "
-            f"({mujoco.mjtWarning(kind).name}); reset it, and check the actions for NaN."
+            f"The physics of environment {index} ({self.scene.task.name}) diverged near step "
+            f"{self.steps[index]} ({mujoco.mjtWarning(kind).name}): check the actions for NaN."
         )
+
+
+def rotate(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Products of matrices (n, i, j) and vectors (n, j), shape (n, i)."""
+    return np.matmul(matrices, vectors[:, :, None])[:, :, 0]
 
 
 def euler_angles(matrices: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -19,7 +19,7 @@ from .tasks import SUCCESS_DISTANCE
 
 RewardType = Literal["sparse", "dense"]
 RENDER_MODES = ("human", "rgb_array")
-METADATA = {"render_modes": list(RENDER_MODES), "render_fps": 25}
+METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 25}
 
 
 class _GoalFace:
@@ -46,22 +46,11 @@ class _GoalFace:
         self.reward_type = reward_type
         self.render_mode = render_mode
         self._picture = Picture(simulation.scene, show_regions)
-        box: Callable[[int], spaces.Box] = lambda size: spaces.Box(
-            -np.inf, np.inf, (size,), np.float64
-        )
-        self.observation_space = spaces.Dict(
-            {
-                "observation": box(simulation.observation_size),
-                "achieved_goal": box(3),
-                "desired_goal": box(3),
-            }
-        )
-        self.action_space = spaces.Box(-1.0, 1.0, (simulation.action_size,), np.float32)
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        """Rewards of achieved goals (..., 3) for desired ones (..., 3), shape (...); `info` is unused.
+        """Rewards (...) of achieved goals (..., 3) for desired ones (..., 3).
 
-        Sparse: 0 within 0.05 m, else -1. Dense: minus the distance in metres.
+        Sparse: 0 within 0.05 m, else -1. Dense: minus the distance in metres. `info` is unused.
         """
         distance = _distance(achieved_goal, desired_goal)
         if self.reward_type == "dense":
@@ -69,7 +58,7 @@ class _GoalFace:
         return -(distance > SUCCESS_DISTANCE).astype(np.float32)
 
     def is_success(self, achieved_goal: np.ndarray, desired_goal: np.ndarray) -> Any:
-        """Whether achieved goals (..., 3) lie within 0.05 m of desired ones, bool of shape (...)."""
+        """Whether achieved goals (..., 3) lie within 0.05 m of desired ones, bool (...)."""
         return _distance(achieved_goal, desired_goal) <= SUCCESS_DISTANCE
 
     def set_markers(self, points: np.ndarray) -> None:
@@ -83,7 +72,7 @@ class _GoalFace:
 
 
 class SingleEnv(_GoalFace, gym.Env):
-    """A batch of one as a gymnasium.Env; it never ends by itself, `gymnasium.make` truncates at T."""
+    """A batch of one as a gymnasium.Env; it never ends, `gymnasium.make` truncates at T."""
 
     metadata = METADATA
     _arguments: dict[str, Any]
@@ -92,6 +81,7 @@ class SingleEnv(_GoalFace, gym.Env):
         self, scene: Scene, reward_type: RewardType, render_mode: str | None, show_regions: bool
     ) -> None:
         self._start(self.simulation_type(scene, 1), reward_type, render_mode, show_regions)
+        self.observation_space, self.action_space = _spaces(self.simulation)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -123,12 +113,15 @@ class SingleEnv(_GoalFace, gym.Env):
         info = {"is_success": bool(self.is_success(achieved, desired))}
         return obs, float(self.compute_reward(achieved, desired, info)), False, False, info
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """A picture (480, 480, 3) with "rgb_array"; None, and a window, with "human"."""
         if self.render_mode is None:
             gym.logger.warn("render() needs render_mode='rgb_array' or 'human'.")
             return None
-        return self._picture.draw(self.simulation, 0, self.render_mode)
+        if self.render_mode == "rgb_array":
+            return self._picture.draw(self.simulation, 0)
+        self._picture.draw_window(self.simulation, 0)
+        return None
 
     def _observation(self) -> dict[str, np.ndarray]:
         observation, achieved = self.simulation.observe()
@@ -171,9 +164,8 @@ class BatchVecEnv(_GoalFace, VecEnv):
     ) -> None:
         simulation = self.simulation_type(scene, n_envs, n_threads)
         self._start(simulation, reward_type, render_mode, show_regions)
-        super().__init__(n_envs, self.observation_space, self.action_space)
+        super().__init__(n_envs, *_spaces(simulation))
         self.horizon = scene.task.horizon
-        self._elapsed = np.zeros(n_envs, dtype=np.int64)
         self._generators = [seeding.np_random()[0] for _ in range(n_envs)]
         self._actions = np.zeros((n_envs, simulation.action_size))
         if seed is not None:
@@ -192,7 +184,6 @@ class BatchVecEnv(_GoalFace, VecEnv):
             if seed is not None:
                 self._generators[index] = seeding.np_random(seed)[0]
             self.simulation.reset(index, self._generators[index])
-        self._elapsed[:] = 0
         self._reset_seeds()
         self._reset_options()
         return self._observations()
@@ -217,8 +208,7 @@ class BatchVecEnv(_GoalFace, VecEnv):
         obs = self._observations()
         achieved, desired = obs["achieved_goal"], obs["desired_goal"]
         rewards = self.compute_reward(achieved, desired, None).astype(np.float32)
-        self._elapsed += 1
-        dones = self._elapsed >= self.horizon
+        dones = self.simulation.steps >= self.horizon
         infos: list[dict[str, Any]] = [
             {"is_success": success, "TimeLimit.truncated": done}
             for success, done in zip(
@@ -230,8 +220,7 @@ class BatchVecEnv(_GoalFace, VecEnv):
                 infos[index]["terminal_observation"] = {
                     key: values[index].copy() for key, values in obs.items()
                 }
-                self.simulation.reset(index, self._generators[index])
-            self._elapsed[dones] = 0
+                self.simulation.reset(int(index), self._generators[index])
             obs = self._observations()
         if self.render_mode == "human":
             self.render()
@@ -241,7 +230,6 @@ class BatchVecEnv(_GoalFace, VecEnv):
         """All that a resumed run needs to go on as if never stopped, generators included."""
         return {
             **self.simulation.get_state(),
-            "elapsed": self._elapsed.copy(),
             "generators": [generator.bit_generator.state for generator in self._generators],
         }
 
@@ -252,21 +240,18 @@ class BatchVecEnv(_GoalFace, VecEnv):
             ValueError: it comes from another number of copies or another task.
         """
         self.simulation.set_state(state)
-        self._elapsed[:] = state["elapsed"]
         for generator, saved in zip(self._generators, state["generators"], strict=True):
             generator.bit_generator.state = saved
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """A picture (480, 480, 3) of every copy."""
-        return [
-            self._picture.draw(self.simulation, index, "rgb_array")
-            for index in range(self.num_envs)
-        ]
+        return [self._picture.draw(self.simulation, index) for index in range(self.num_envs)]
 
     def render(self, mode: str | None = None) -> np.ndarray | None:
         """All copies tiled with "rgb_array"; the first copy in a window with "human"."""
         if (mode or self.render_mode) == "human":
-            return self._picture.draw(self.simulation, 0, "human")
+            self._picture.draw_window(self.simulation, 0)
+            return None
         return super().render(mode)
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
@@ -297,3 +282,11 @@ class BatchVecEnv(_GoalFace, VecEnv):
 
 def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(np.asarray(first) - np.asarray(second), axis=-1))
+
+
+def _spaces(simulation: BatchedSimulation) -> tuple[spaces.Dict, spaces.Box]:
+    sizes = {"observation": simulation.observation_size, "achieved_goal": 3, "desired_goal": 3}
+    observation = spaces.Dict(
+        {key: spaces.Box(-np.inf, np.inf, (size,), np.float64) for key, size in sizes.items()}
+    )
+    return observation, spaces.Box(-1.0, 1.0, (simulation.action_size,), np.float32)

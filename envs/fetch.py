@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles
+from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles, rotate
 from .faces import BatchVecEnv, RewardType, SingleEnv
 from .ids import task_of
 from .scene import FINGER_JOINTS, GRIP_SITE, Scene, fetch_scene
@@ -18,7 +18,7 @@ _DOWNWARD = np.array([1.0, 0.0, 1.0, 0.0])
 
 
 class FetchSimulation(BatchedSimulation):
-    """The Fetch robot: actions move its gripper (3) and its fingers (1), observations are v4's 25."""
+    """The Fetch robot: actions move gripper (3) and fingers (1), observations are v4's 25."""
 
     action_size = 4
     observation_size = 25
@@ -37,6 +37,7 @@ class FetchSimulation(BatchedSimulation):
         self._watch("grip_pos", [d.site_xpos[self._grip_site] for d in self.data])
 
     def control(self, actions: np.ndarray) -> None:
+        """Pull the gripper by 0.05 m times the action, and the fingers by the action itself."""
         self._target_pos[:] = self.read["welded_pos"] + actions[:, :3] * MAX_DISPLACEMENT
         self._target_quat[:] = self.read["welded_quat"] + _DOWNWARD
         if not self.scene.task.blocked_gripper:
@@ -45,21 +46,23 @@ class FetchSimulation(BatchedSimulation):
                 control[:] = target
 
     def after_substeps(self, index: int) -> None:
+        """Close blocked fingers."""
         data = self.data[index]
         if self.scene.task.blocked_gripper:
             data.qpos[self._finger_qpos] = 0.0
             mujoco.mj_forward(self.scene.model, data)
 
     def refresh(self, index: int) -> None:
+        """Read one copy, and how its joints move the gripper."""
         super().refresh(index)
         jacobian = self.read["grip_jacobian"][index]
         mujoco.mj_jacSite(self.scene.model, self.data[index], jacobian, None, self._grip_site)
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
+        """Observations (n_envs, 25) in the order of FetchPickAndPlace-v4, and object positions."""
         read = self.read
         linear, angular = self._object_velocities()
-        grip_velocity = np.einsum("nij,nj->ni", read["grip_jacobian"], read["qvel"])
-        grip_velocity *= self.dt
+        grip_velocity = rotate(read["grip_jacobian"], read["qvel"]) * self.dt
         parts = (
             read["grip_pos"],
             read["object_pos"],
@@ -79,7 +82,7 @@ class FetchEnv(SingleEnv):
 
     Args:
         task: key in `TASKS`, or a row of one's own.
-        reward_type: "sparse" (0 within 0.05 m of the goal, else -1) or "dense" (minus the distance, m).
+        reward_type: "sparse" (0 within 0.05 m of the goal, else -1) or "dense" (minus metres).
         render_mode: None, "rgb_array" or "human".
         collision: "reachable" leaves out pairs that do not matter, "full" tests all.
         show_regions: draw where start and goal come from.

@@ -20,10 +20,12 @@ class ObjectSimulation(BatchedSimulation):
     observation_size = 12
 
     def control(self, actions: np.ndarray) -> None:
+        """Pull the object off its pose by 0.05 times the action."""
         self._target_pos[:] = self.read["welded_pos"] + actions[:, :3] * MAX_DISPLACEMENT
         self._target_quat[:] = self.read["welded_quat"] + actions[:, 3:] * MAX_DISPLACEMENT
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position, Euler angles, linear and angular velocity (n_envs, 12), and positions."""
         position = self.read["object_pos"]
         angles = euler_angles(self.read["object_mat"].reshape(-1, 3, 3))
         parts = (position, angles, *self._object_velocities())
@@ -38,7 +40,7 @@ class ObjectEnv(SingleEnv):
 
     Args:
         task: key in `TASKS`, or a row of one's own.
-        reward_type: "sparse" (0 within 0.05 m of the goal, else -1) or "dense" (minus the distance, m).
+        reward_type: "sparse" (0 within 0.05 m of the goal, else -1) or "dense" (minus metres).
         render_mode: None, "rgb_array" or "human".
         show_regions: draw where start and goal come from.
 

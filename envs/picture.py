@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from importlib import import_module
 from typing import Any
 
 import mujoco
@@ -12,12 +14,14 @@ from .scene import OBJECT, Scene, fetch_spec, object_only
 from .tasks import SUCCESS_DISTANCE, Region, reference_point
 
 SIZE = 480  # pixels, both ways
-_LOOK_AT = (1.3, 0.75, 0.55)
-_DISTANCE, _AZIMUTH, _ELEVATION = 1.9, 132.0, -20.0
+_LOOK_AT = (1.3, 0.75, 0.5)
+_DISTANCE, _AZIMUTH, _ELEVATION = 1.7, 132.0, -25.0
+_OBJECT_RGBA = (0.95, 0.65, 0.1, 1.0)
 _GOAL_RGBA = (0.9, 0.1, 0.1, 0.8)
 _START_REGION_RGBA = (0.1, 0.4, 0.9, 0.15)
 _GOAL_REGION_RGBA = (0.9, 0.2, 0.1, 0.12)
 _MARKER_RGBA = (0.1, 0.7, 0.2, 0.6)
+_RADIUS = 0.4 * SUCCESS_DISTANCE
 _THIN = 0.002  # half the least thickness of a drawn region, metres
 
 
@@ -33,10 +37,8 @@ class Picture:
         self._scene = scene
         self._show_regions = show_regions
         self._markers = np.zeros((0, 3))
-        self._model: mujoco.MjModel | None = None
-        self._data: mujoco.MjData | None = None
-        self._renderer: Any = None
-        self._window: Any = None
+        self._canvas: _Canvas | None = None
+        self._window: _Window | None = None
 
     def set_markers(self, points: np.ndarray) -> None:
         """Points (n, 3) in metres to draw from now on.
@@ -49,85 +51,54 @@ class Picture:
             raise ValueError(f"Markers must have shape (n, 3), not {points.shape}.")
         self._markers = points.copy()
 
-    def draw(self, simulation: BatchedSimulation, index: int, mode: str) -> np.ndarray | None:
-        """One copy as an array (480, 480, 3) of uint8, or in the window with mode "human".
+    def draw(self, simulation: BatchedSimulation, index: int) -> np.ndarray:
+        """One copy as an array (480, 480, 3) of uint8.
 
         Raises:
             RuntimeError: there is no graphics library to draw with.
         """
-        if self._model is None:
-            self._model = self._whole_model()
-            self._data = mujoco.MjData(self._model)
-        # The physics model lacks what touches nothing, so the state is shown on the whole one.
-        source = simulation.data[index]
-        self._data.qpos[:] = source.qpos
-        self._data.mocap_pos[:] = source.mocap_pos
-        self._data.mocap_quat[:] = source.mocap_quat
-        mujoco.mj_forward(self._model, self._data)
-        goal = simulation.goals[index]
-        return self._draw_window(goal) if mode == "human" else self._draw_array(goal)
+        if self._canvas is None:
+            self._canvas = _Canvas(whole_model(self._scene))
+        self._canvas.show(simulation, index)
+        self._add_shapes(self._canvas.scene, simulation.goals[index])
+        return self._canvas.pixels()
+
+    def draw_window(self, simulation: BatchedSimulation, index: int) -> None:
+        """One copy in a window, opened the first time.
+
+        Raises:
+            RuntimeError: no window can be opened.
+        """
+        if self._window is None:
+            self._window = _Window(whole_model(self._scene))
+        with self._window.viewer.lock():
+            _copy_state(simulation, index, self._window.model, self._window.data)
+            self._window.viewer.user_scn.ngeom = 0
+            self._add_shapes(self._window.viewer.user_scn, simulation.goals[index])
+        self._window.viewer.sync()
 
     def close(self) -> None:
         """Let the graphics go."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        if self._canvas is not None:
+            self._canvas.close()
+            self._canvas = None
         if self._window is not None:
-            self._window.close()
+            self._window.viewer.close()
             self._window = None
 
-    def _whole_model(self) -> mujoco.MjModel:
-        spec = fetch_spec(self._scene.task)
-        if self._scene.alone:
-            spec = object_only(spec, OBJECT)
-        # The goal is drawn by hand; the asset's own mark would stand still.
-        spec.delete(next(site for site in spec.sites if site.name == "target0"))
-        model = spec.compile()
-        model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
-        return model
-
-    def _draw_array(self, goal: np.ndarray) -> np.ndarray:
-        if self._renderer is None:
-            try:
-                self._renderer = mujoco.Renderer(self._model, SIZE, SIZE)
-            except Exception as error:  # each graphics library fails with an error of its own
-                raise RuntimeError(
-                    "No OpenGL to draw with: install libegl1 or libosmesa6 and set "
-                    f"MUJOCO_GL=egl or MUJOCO_GL=osmesa ({error})."
-                ) from error
-        camera = mujoco.MjvCamera()
-        _point(camera)
-        self._renderer.update_scene(self._data, camera)
-        self._add_shapes(self._renderer.scene, goal)
-        return self._renderer.render()
-
-    def _draw_window(self, goal: np.ndarray) -> None:
-        if self._window is None:
-            try:
-                import mujoco.viewer
-
-                self._window = mujoco.viewer.launch_passive(self._model, self._data)
-            except Exception as error:  # no display, or a library of it is missing
-                raise RuntimeError(f"No window can be opened here ({error}).") from error
-            _point(self._window.cam)
-        with self._window.lock():
-            self._window.user_scn.ngeom = 0
-            self._add_shapes(self._window.user_scn, goal)
-        self._window.sync()
-
-    def _add_shapes(self, canvas: Any, goal: np.ndarray) -> None:
+    def _add_shapes(self, scene: Any, goal: np.ndarray) -> None:
         sphere, box = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX
-        task, rest = self._scene.task, self._scene.landmarks.rest_height
         for point in self._markers:
-            _add_shape(canvas, sphere, point, np.full(3, 0.4 * SUCCESS_DISTANCE), _MARKER_RGBA)
-        _add_shape(canvas, sphere, goal, np.full(3, 0.4 * SUCCESS_DISTANCE), _GOAL_RGBA)
+            _add_shape(scene, sphere, point, np.full(3, _RADIUS), _MARKER_RGBA)
+        _add_shape(scene, sphere, goal, np.full(3, _RADIUS), _GOAL_RGBA)
         if self._show_regions:
+            task, rest = self._scene.task, self._scene.landmarks.rest_height
             low = rest if task.height.chance < 1 else rest + task.height.low
             for region, bottom, top, rgba in (
                 (task.start, rest, rest, _START_REGION_RGBA),
                 (task.goal, low, rest + task.height.high, _GOAL_REGION_RGBA),
             ):
-                _add_shape(canvas, box, *self._extent(region, bottom, top), rgba)
+                _add_shape(scene, box, *self._extent(region, bottom, top), rgba)
 
     def _extent(self, region: Region, bottom: float, top: float) -> tuple[np.ndarray, np.ndarray]:
         """Centre and half-size of the box that a region spans between two heights."""
@@ -137,17 +108,107 @@ class Picture:
         return (low + high) / 2, np.maximum((high - low) / 2, _THIN)
 
 
+class _Canvas:
+    """Off-screen drawing of one model."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._context = _graphics_context()
+        self._context.make_current()
+        model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
+        self._model = model
+        self._data = mujoco.MjData(model)
+        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._rectangle = mujoco.MjrRect(0, 0, SIZE, SIZE)
+        self._pen = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._pen)
+        self.scene = mujoco.MjvScene(model, maxgeom=2000)
+        _point(self._camera)
+
+    def show(self, simulation: BatchedSimulation, index: int) -> None:
+        """Put the state of a copy into the drawn scene."""
+        _copy_state(simulation, index, self._model, self._data)
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(
+            self._model, self._data, self._option, None, self._camera, everything, self.scene
+        )
+
+    def pixels(self) -> np.ndarray:
+        """The drawn scene, row 0 at the top."""
+        self._context.make_current()
+        image = np.empty((SIZE, SIZE, 3), dtype=np.uint8)
+        mujoco.mjr_render(self._rectangle, self.scene, self._pen)
+        mujoco.mjr_readPixels(image, None, self._rectangle, self._pen)
+        return np.ascontiguousarray(image[::-1])
+
+    def close(self) -> None:
+        """Free the graphics memory and the context."""
+        self._context.make_current()
+        self._pen.free()
+        self._context.free()
+
+
+class _Window:
+    """A window on one model."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model, self.data = model, mujoco.MjData(model)
+        try:
+            self.viewer = import_module("mujoco.viewer").launch_passive(model, self.data)
+        except Exception as error:  # no display, or a library of it is missing
+            raise RuntimeError(f"No window can be opened here ({error}).") from error
+        _point(self.viewer.cam)
+
+
+def whole_model(scene: Scene) -> mujoco.MjModel:
+    """A scene with everything that can be seen; its joints and mocap bodies are the physics'."""
+    spec = fetch_spec(scene.task)
+    # The goal and what pulls the gripper are marks; the goal's is drawn where the goal is.
+    spec.delete(next(site for site in spec.sites if site.name == "target0"))
+    for geom in list(spec.geoms):
+        if geom.parent.name == "robot0:mocap":
+            spec.delete(geom)
+        elif geom.name == OBJECT:
+            geom.material = ""
+            geom.rgba = _OBJECT_RGBA
+    return (object_only(spec, OBJECT) if scene.alone else spec).compile()
+
+
+def _copy_state(
+    simulation: BatchedSimulation, index: int, model: mujoco.MjModel, data: mujoco.MjData
+) -> None:
+    source = simulation.data[index]
+    data.qpos[:] = source.qpos
+    data.mocap_pos[:] = source.mocap_pos
+    data.mocap_quat[:] = source.mocap_quat
+    mujoco.mj_forward(model, data)
+
+
+def _graphics_context() -> Any:
+    """A context of the library that MUJOCO_GL names, or else of the first one that works here."""
+    named = os.environ.get("MUJOCO_GL")
+    screen = ["glfw"] if "DISPLAY" in os.environ else []
+    reasons = []
+    for library in [named] if named else [*screen, "egl", "osmesa"]:
+        try:
+            return import_module(f"mujoco.{library}").GLContext(SIZE, SIZE)
+        except Exception as error:  # each library fails with errors of its own
+            reasons.append(f"{library}: {error}")
+    raise RuntimeError(
+        "There is no OpenGL to draw with; install libegl1 or libosmesa6, or set MUJOCO_GL to "
+        f"the library there is ({'; '.join(reasons)})."
+    )
+
+
 def _point(camera: Any) -> None:
     camera.lookat[:] = _LOOK_AT
     camera.distance, camera.azimuth, camera.elevation = _DISTANCE, _AZIMUTH, _ELEVATION
 
 
 def _add_shape(
-    canvas: Any, kind: Any, centre: np.ndarray, size: np.ndarray, rgba: tuple[float, ...]
+    scene: Any, kind: Any, centre: np.ndarray, size: np.ndarray, rgba: tuple[float, ...]
 ) -> None:
-    if canvas.ngeom >= canvas.maxgeom:
+    if scene.ngeom >= scene.maxgeom:
         return
-    shape = canvas.geoms[canvas.ngeom]
-    turn = np.eye(3).ravel()
-    mujoco.mjv_initGeom(shape, kind, size, centre, turn, np.array(rgba, dtype=np.float32))
-    canvas.ngeom += 1
+    turn, colour = np.eye(3).ravel(), np.array(rgba, dtype=np.float32)
+    mujoco.mjv_initGeom(scene.geoms[scene.ngeom], kind, size, centre, turn, colour)
+    scene.ngeom += 1

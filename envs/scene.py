@@ -1,7 +1,7 @@
 """Scenes composed with MjSpec: robot, table, obstacles and object, and the object alone.
 
-The robot, table and object are the Fetch assets that gymnasium-robotics installs; only their place on
-disk is looked up, so that package's own checks of the mujoco version never run.
+The robot, table and object are the Fetch assets that gymnasium-robotics installs. Only their place
+on disk is looked up: that package is never imported, and so its limits on mujoco are not ours.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ _SETUP_STEPS = 10
 _TUBE_STORE = (1.3, 0.75, -0.5)
 
 COLLISIONS = ("reachable", "full")
-# collision="reachable": two geoms are tested when one's bit is in the other's mask. Kept is every pair of a
-# robot part with floor, table, obstacles, tube or object, and of the arm with the trunk (the shoulder
-# rubs against the torso when the gripper is far out, so leaving that out changes where the gripper
-# goes). Left out are links of the arm against each other and the three parts named last, whose geoms
-# leave the physics model.
+# collision="reachable": two geoms are tested when one's bit is in the other's mask. Kept is every
+# pair of a robot part with floor, table, obstacles, tube or object, and of the arm with the trunk
+# (the shoulder rubs against the torso when the gripper is far out, and leaving that out changes
+# where the gripper goes). Left out are links of the arm against each other, except for the hand
+# against the upper arm, and the three parts named last, whose geoms leave the physics model.
 _FLOOR, _STANDING, _OBJECT_BIT, _TRUNK, _UPPER_ARM = 1, 2, 4, 8, 16
 _WORLD = _FLOOR | _STANDING | _OBJECT_BIT
 _ROBOT_BITS = {
@@ -133,8 +133,8 @@ def fetch_spec(task: Task) -> mujoco.MjSpec:
 def object_only(spec: mujoco.MjSpec, body_name: str) -> mujoco.MjSpec:
     """A scene with one free body and without the robot: the body is welded to a new mocap body.
 
-    What stands still stays, other free bodies too; articulated bodies and the mocap bodies that pull
-    them go, and with them actuators, sensors, tendons, equalities and keyframes (section 3.1).
+    What stands still stays, other free bodies too. Articulated bodies and the mocap bodies that
+    pull them go, and with them actuators, sensors, tendons, equalities, keyframes (section 3.1).
 
     Args:
         spec: any scene; it is not changed.
@@ -194,8 +194,8 @@ def strip_visuals(spec: mujoco.MjSpec) -> mujoco.MjSpec:
 def physics_digest(task: Task) -> str:
     """A short hash of what decides the object's motion: its scene, its samplers, the substeps.
 
-    Numbers of the compiled scene are hashed and not its XML, whose wording changes between releases of
-    mujoco.
+    Numbers of the compiled scene are hashed and not its XML, whose wording changes between
+    releases of mujoco.
     """
     model = object_scene(task).model
     fields = (
@@ -222,7 +222,7 @@ def _set_up(task: Task, model: mujoco.MjModel) -> Scene:
     for name, value in _SLIDES.items():
         data.joint(name).qpos = value
     data.joint(f"{OBJECT}:joint").qpos = _OBJECT_QPOS
-    # The weld holds the gripper in the mocap's own pose; its quaternion's vector part stays compiled.
+    # As the original: the weld holds the gripper where the mocap is, turned as compiled.
     model.eq_data[0, :7] = [0, 0, 0, 0, 0, 0, 1]
     mujoco.mj_forward(model, data)
     mocap, _ = weld_targets(model)

@@ -34,7 +34,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Height:
-    """How far above the object's resting height a goal lies: U(low, high) with this chance, else 0."""
+    """How far a goal lies above a resting object: U(low, high) with this chance, else 0."""
 
     low: float = 0.0
     high: float = 0.0
