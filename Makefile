@@ -16,7 +16,7 @@ endif
 .PHONY: train test lint test-mujoco-range clean
 
 train: $(INSTALLED)
-	$(BIN)/sb3-follow-object train --env $(ENV) --run $(RUN) $(if $(wildcard $(RUN)),--resume)
+	$(BIN)/sb3-follow-object train --env $(ENV) --run $(RUN) --resume-or-start
 
 test: lint
 	$(BIN)/pytest -q -n 2 --dist loadgroup

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.metadata
 import json
 import os
@@ -21,10 +22,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from .callbacks import OriginalGoalEvalCallback
 from .checkpoint import load_tree, save_tree
-from .envs import make_vec
+from .envs import make_vec, object_id
 from .files import atomic_write
 from .follow_object import FollowObject, Report, stream_seed
 from .goal_predictor import GoalPredictor
+from .her_ddpg import HerDDPG
 from .policies import load_actor, save_actor
 from .rollout import Episodes, run_episodes
 
@@ -181,7 +183,7 @@ def train(
         KeyboardInterrupt: after the checkpoint of an interrupted run.
     """
     folder = Path(folder)
-    _claim(folder, config, resume)
+    _check_folder(folder, config, resume)
     if resume and (folder / RESULT).exists():
         report(f"{folder} is finished already")
         return json.loads((folder / RESULT).read_text())
@@ -189,12 +191,18 @@ def train(
     predictor = None
     if (folder / PREDICTOR).exists():
         predictor = GoalPredictor.load(folder / PREDICTOR, env_id=config.env_id)
+    settings = copy.deepcopy(config.settings)  # SB3 writes into policy_kwargs
     run = FollowObject(
-        config.env_id, seed=config.seed, predictor=predictor, report=report, **config.settings
+        config.env_id, seed=config.seed, predictor=predictor, report=report, **settings
     )
     saved = None
     if resume and (folder / CHECKPOINT).exists():
         saved = load_tree(folder / CHECKPOINT)
+    _check_algorithms(run)
+    if not resume:
+        _claim(folder, config)
+    elif saved is None:  # stopped before the first checkpoint: what was evaluated begins anew
+        (folder / EVALUATIONS).unlink(missing_ok=True)
     stage_file = folder / "object_stage.json"
     if saved is None and predictor is not None and stage_file.exists():
         stage = json.loads(stage_file.read_text())
@@ -279,22 +287,70 @@ def evaluate(
         env.close()
 
 
-def _claim(folder: Path, config: RunConfig, resume: bool) -> None:
-    """Create the folder with its config and versions, or check that it is this run's."""
-    text = json.dumps(asdict(config), indent=2)
-    if resume:
-        if not (folder / CONFIG).exists():
-            raise ValueError(f"{folder} holds no run to resume")
-        if json.loads((folder / CONFIG).read_text()) != json.loads(text):
-            raise ValueError(f"{folder} holds a run with another configuration")
+def trained_steps(folder: str | os.PathLike[str]) -> int | None:
+    """Return the env steps that a run folder's training took; None where it does not say."""
+    folder = Path(folder)
+    if (folder / RESULT).exists():
+        return int(json.loads((folder / RESULT).read_text())["env_steps"])
+    if (folder / EVALUATIONS).exists():
+        rows = (folder / EVALUATIONS).read_text().splitlines()[1:]
+        return int(rows[-1].split(",")[0]) if rows else None
+    return None
+
+
+def _check_folder(folder: Path, config: RunConfig, resume: bool) -> None:
+    """Raise unless the folder is this run's or, where one starts, absent or empty."""
+    if not resume:
+        if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+            raise ValueError(f"{folder} is not empty; resume the run in it or give another folder")
         return
-    if folder.exists() and any(folder.iterdir()):
-        raise ValueError(f"{folder} is not empty; resume the run in it or give another folder")
+    if not (folder / CONFIG).exists():
+        raise ValueError(f"{folder} holds no run to resume")
+    kept = _flat(json.loads((folder / CONFIG).read_text()))
+    wanted = _flat(json.loads(json.dumps(asdict(config))))
+    for name in {**kept, **wanted}:
+        if kept.get(name) != wanted.get(name):
+            raise ValueError(
+                f"the run in {folder} has {name} {kept.get(name)!r}, not {wanted.get(name)!r}; "
+                "resume it as it is or start another in another folder"
+            )
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings by their dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        nested = _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else None
+        flat |= {f"{prefix}{name}": value} if nested is None else nested
+    return flat
+
+
+def _check_algorithms(run: FollowObject) -> None:
+    """Build both algorithms once, in small, so that a wrong argument is not found hours later."""
+    small = {"policy": "MultiInputPolicy", "buffer_size": 10 * run.env.num_envs}
+    settings = run.settings
+    envs = [(run.env, settings["algorithm"])]
+    if run.imagine:
+        object_env = make_vec(object_id(run.env_id), 1)
+        envs.append((object_env, settings["object_algorithm"]))
+    for env, arguments in envs:
+        arguments = copy.deepcopy(arguments)
+        replay = {**(arguments.get("replay_buffer_kwargs") or {}), "imagined_ratio": 0.0}
+        try:
+            HerDDPG(env=env, **{**arguments, **small, "replay_buffer_kwargs": replay})
+        except (TypeError, AssertionError) as error:
+            raise ValueError(f"the algorithm cannot be built: {error}") from error
+    if run.imagine:
+        object_env.close()
+
+
+def _claim(folder: Path, config: RunConfig) -> None:
+    """Create the folder with its config and versions."""
     folder.mkdir(parents=True, exist_ok=True)
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
     versions["python"] = platform.python_version()
     atomic_write(folder / "versions.json", json.dumps(versions, indent=2).encode())
-    atomic_write(folder / CONFIG, text.encode())
+    atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
 
 
 def _logger(folder: Path, env_steps: int) -> Logger:

@@ -1,0 +1,325 @@
+"""Settings of a run: from YAML files in rl_zoo3's layout and from single overrides."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import yaml
+from stable_baselines3.td3.policies import TD3Policy
+
+from . import zoo_configs
+from .curriculum import Curriculum
+from .envs import IDS, object_id
+from .envs.tasks import did_you_mean
+from .experiment import CONFIG, RunConfig
+from .follow_object import FollowObject
+from .goal_predictor import GoalPredictor
+from .her_ddpg import HerDDPG
+from .her_replay_buffer import FollowObjectReplayBuffer
+from .policies import HerPolicy
+
+METHODS = ("fo", "her")
+PRESETS = ("default", "paper")
+
+WRAPPER = "sb3_follow_object.ImaginedGoalWrapper"
+CALLBACK = "sb3_follow_object.CurriculumCallback"
+# The callback's keyword arguments, and what FollowObject calls them.
+_CALLBACK_NAMES = {"every": "test_every", "n_episodes": "n_test_episodes", "store": "store_tests"}
+
+# What the run itself decides, or what YAML cannot hold.
+_NOT_SETTINGS = {"self", "env", "env_id", "seed", "settings", "method", "imagine", "algorithm"}
+_NOT_SETTINGS |= {"predictor", "report", "_init_setup_model", "tensorboard_log", "action_noise"}
+_NOT_SETTINGS |= {"replay_buffer_class", "total_timesteps", "horizon", "args", "kwargs"}
+_NOT_SETTINGS |= {"observation_space", "action_space", "lr_schedule", "reward_function"}
+_NOT_SETTINGS |= {"paths", "goals", "physics", "progress"}
+
+_AT_LEAST_ONE = {"n_timesteps", "batch_size", "buffer_size", "gradient_steps", "n_paths"}
+_AT_LEAST_ONE |= {"object_timesteps", "test_every", "n_test_episodes", "n_threads"}
+
+
+def preset_file(method: str, preset: str = "default") -> Path:
+    """Return the YAML file of a method that comes with the package."""
+    name = method if preset == "default" else f"{method}-{preset}"
+    return Path(str(zoo_configs.__file__)).with_name(f"{name}.yml")
+
+
+def run_config(
+    env_id: str,
+    *,
+    method: str | None = None,
+    preset: str = "default",
+    file: str | Path | None = None,
+    seed: int = 0,
+    overrides: Mapping[str, Any] | None = None,
+) -> RunConfig:
+    """Read a task's settings and return the configuration of a run.
+
+    Args:
+        env_id: the task; the file must have an entry for it, or one named "default".
+        method: "fo" or "her"; None takes what the file trains, without a file "fo".
+        preset: "default" or "paper", of the files that come with the package.
+        file: YAML in rl_zoo3's layout, in place of a preset.
+        seed: of the run.
+        overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win.
+
+    Raises:
+        ValueError: an id, a file, a key or a value that cannot be meant, with the nearest that can.
+    """
+    check_id(env_id)
+    if file is None:
+        method = method or "fo"
+        path = preset_file(method, preset)
+    else:
+        path = Path(file)
+    entries = read_yaml(path)
+    entry = _entry(entries, env_id, path)
+    imagine = WRAPPER in _named(entry, "env_wrapper", path)
+    found = "fo" if imagine else "her"
+    if method is not None and method != found:
+        raise ValueError(
+            f"{path} trains {env_id} with method {found!r}, not {method!r}: only entries with "
+            f"env_wrapper {WRAPPER} imagine goals"
+        )
+    settings = _flattened(entry, path)
+    if imagine and env_id in IDS and object_id(env_id) in entries:
+        alone = dict(_entry(entries, object_id(env_id), path))
+        alone.pop("policy", None)  # rl_zoo3 wants it; the first stage knows only one
+        if "n_timesteps" in alone:
+            settings["object_timesteps"] = alone.pop("n_timesteps")
+        settings["object_algorithm"] = alone
+    schema = _schema()
+    changes: dict[str, Any] = {}
+    for name, value in (overrides or {}).items():
+        _override(changes, name, value)
+        _override(settings, name, value)
+    _check(changes, schema, "--set")
+    _check(settings, schema, str(path))
+
+    total_timesteps = settings.pop("n_timesteps", RunConfig.total_timesteps)
+    of_run = {name: settings.pop(name) for name in list(settings) if name in schema["run"]}
+    of_class: dict[str, Any] = {"imagine": imagine}
+    of_class |= {name: settings.pop(name) for name in list(settings) if name in schema["class"]}
+    if settings:
+        of_class["algorithm"] = settings
+    return RunConfig(
+        env_id,
+        found,
+        seed=seed,
+        total_timesteps=total_timesteps,
+        settings=_with_tuples(of_class),
+        **of_run,
+    )
+
+
+def load_config(folder: str | Path) -> RunConfig:
+    """Return the configuration that a run folder was started with.
+
+    Raises:
+        ValueError: the folder holds no run, or its configuration is damaged.
+    """
+    path = Path(folder) / CONFIG
+    try:
+        saved = json.loads(path.read_text())
+        return RunConfig(**{**saved, "settings": _with_tuples(saved["settings"])})
+    except FileNotFoundError as error:
+        raise ValueError(f"{folder} holds no run: there is no {path}") from error
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is not the configuration of a run ({error})") from error
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """Split "key.sub=value", the value in YAML's notation, into name and value.
+
+    Raises:
+        ValueError: there is no "=", or the value is no YAML.
+    """
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise ValueError(f"{text!r} is no setting; write key=value or key.sub=value")
+    try:
+        parsed = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise ValueError(f"the value of {text!r} is not YAML") from error
+    return name, _number(parsed)
+
+
+def check_id(env_id: str) -> None:
+    """Raise a ValueError that names the nearest id unless gymnasium knows this one."""
+    module, _, name = env_id.rpartition(":")
+    if module:
+        try:
+            import_module(module)
+        except ImportError as error:
+            raise ValueError(f"{env_id!r} names a module that cannot be imported") from error
+    if name not in gym.registry:
+        near = did_you_mean(name, [*IDS, *gym.registry])
+        raise ValueError(f"there is no environment {env_id!r}{near}")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Return a YAML file's mapping of env ids to settings.
+
+    Raises:
+        ValueError: the file is missing, is not YAML, or is not such a mapping.
+    """
+    try:
+        entries = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(entries, dict):
+        raise ValueError(f"{path} is not a mapping from environment ids to settings")
+    return entries
+
+
+def _entry(entries: dict[str, Any], env_id: str, path: Path) -> dict[str, Any]:
+    entry = entries.get(env_id, entries.get("default"))
+    if entry is None:
+        raise ValueError(f"{path} has no settings for {env_id!r}{did_you_mean(env_id, entries)}")
+    if not isinstance(entry, dict):
+        raise ValueError(f"{path}: the settings of {env_id!r} are not a mapping")
+    return entry
+
+
+def _named(entry: dict[str, Any], key: str, path: Path) -> dict[str, dict[str, Any]]:
+    """Return rl_zoo3's list of class names, each bare or with arguments, as one mapping."""
+    given = entry.get(key) or []
+    named: dict[str, dict[str, Any]] = {}
+    for item in given if isinstance(given, list) else [given]:
+        if isinstance(item, dict) and len(item) == 1:
+            ((name, arguments),) = item.items()
+            named[name] = arguments or {}
+        elif isinstance(item, str):
+            named[item] = {}
+        else:
+            raise ValueError(f"{path}: {key} must list class names with arguments, not {item!r}")
+    known = {"env_wrapper": WRAPPER, "callback": CALLBACK}[key]
+    for name, arguments in named.items():
+        if name != known:
+            raise ValueError(f"{path}: {key} can hold {known} here, not {name!r}")
+        if not isinstance(arguments, dict):
+            raise ValueError(f"{path}: the arguments of {name} are not a mapping")
+    return named
+
+
+def _flattened(entry: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return an entry with the arguments of its wrapper, callback and environments as settings."""
+    settings = json.loads(json.dumps(entry))  # anchors share what overrides are about to change
+    for arguments in _named(settings, "env_wrapper", path).values():
+        _check_names(arguments, ("predictor", "curriculum"), f"{path}: {WRAPPER}")
+        if arguments.get("predictor", "auto") != "auto":
+            raise ValueError(f"{path}: a run makes its own predictor; leave it out or say auto")
+        settings["curriculum"] = arguments.get("curriculum") or {}
+    for arguments in _named(settings, "callback", path).values():
+        _check_names(arguments, _CALLBACK_NAMES, f"{path}: {CALLBACK}")
+        settings |= {_CALLBACK_NAMES[name]: value for name, value in arguments.items()}
+    env_kwargs = settings.get("env_kwargs") or {}
+    _check_names(env_kwargs, ("reward_type",), f"{path}: env_kwargs")
+    settings |= env_kwargs
+    return {
+        name: value
+        for name, value in settings.items()
+        if name not in ("env_wrapper", "callback", "env_kwargs")
+    }
+
+
+def _override(settings: dict[str, Any], name: str, value: Any) -> None:
+    *outer, last = name.split(".")
+    for part in outer:
+        inner = settings.get(part)
+        settings[part] = dict(inner) if isinstance(inner, dict) else {}
+        settings = settings[part]
+    settings[last] = value
+
+
+def _parameters(*functions: Callable[..., Any]) -> dict[str, Any]:
+    """Return names and defaults of what can be set; the later function's default wins."""
+    return {
+        name: parameter.default
+        for function in functions
+        for name, parameter in inspect.signature(function).parameters.items()
+        if name not in _NOT_SETTINGS
+    }
+
+
+def _schema() -> dict[str, dict[str, Any]]:
+    """Return everything that can be set and its default; a dict has settings of its own."""
+    algorithm = _parameters(HerDDPG.__init__)
+    buffer = _parameters(FollowObjectReplayBuffer.__init__)
+    for name in ("buffer_size", "device", "n_envs", "optimize_memory_usage"):
+        del buffer[name]  # the algorithm's
+    algorithm["replay_buffer_kwargs"] = buffer
+    algorithm["policy_kwargs"] = _parameters(TD3Policy.__init__, HerPolicy.__init__)
+    of_class = _parameters(FollowObject.__init__)
+    of_class["curriculum"] = _parameters(Curriculum.__init__)
+    of_class["object_algorithm"] = {n: v for n, v in algorithm.items() if n != "policy"}
+    of_class["predictor_fit"] = _parameters(GoalPredictor.fit)
+    return {"algorithm": algorithm, "class": of_class, "run": _parameters(RunConfig)}
+
+
+def _check(settings: dict[str, Any], schema: dict[str, dict[str, Any]], where: str) -> None:
+    known = {name: default for part in schema.values() for name, default in part.items()}
+    _check_tree(settings, {"n_timesteps": RunConfig.total_timesteps, **known}, where)
+
+
+def _check_tree(settings: dict[str, Any], known: dict[str, Any], where: str) -> None:
+    _check_names(settings, known, where)
+    for name, value in settings.items():
+        default = known[name]
+        if isinstance(default, dict):
+            if value is not None and not isinstance(value, dict):
+                raise ValueError(f"{where}: {name} must be a mapping, not {value!r}")
+            _check_tree(value or {}, default, f"{where}: {name}")
+        elif not _fits(value, default):
+            kind = "true or false" if isinstance(default, bool) else f"like {default!r}"
+            raise ValueError(f"{where}: {name} must be {kind}, not {value!r}")
+        elif name in _AT_LEAST_ONE and isinstance(value, int) and value < 1:
+            raise ValueError(f"{where}: {name} is {value}; it must be at least 1")
+
+
+def _check_names(settings: Any, known: Any, where: str) -> None:
+    if not isinstance(settings, dict):
+        raise ValueError(f"{where} must be a mapping, not {settings!r}")
+    for name in settings:
+        if name not in known:
+            raise ValueError(f"{where} has no setting {name!r}{did_you_mean(name, known)}")
+
+
+def _fits(value: Any, default: Any) -> bool:
+    """Whether a value can stand where a default of a plain type does; others are not judged."""
+    if isinstance(default, bool):
+        return isinstance(value, bool)
+    if isinstance(default, int | float):
+        kinds = (int,) if isinstance(default, int) else (int, float)
+        return isinstance(value, kinds) and not isinstance(value, bool)
+    return not isinstance(default, str) or isinstance(value, str)
+
+
+def _number(value: Any) -> Any:
+    """Read 1e-3 as the number that YAML 1.1 takes for a word."""
+    if not isinstance(value, str):
+        return value
+    try:
+        number = float(value)
+    except ValueError:
+        return value
+    return int(number) if number.is_integer() else number
+
+
+def _with_tuples(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings with SB3's train_freq, a list in YAML and JSON, as the tuple it wants."""
+    return {
+        name: _with_tuples(value)
+        if isinstance(value, dict)
+        else tuple(value)
+        if name == "train_freq" and isinstance(value, list)
+        else value
+        for name, value in settings.items()
+    }

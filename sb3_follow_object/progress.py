@@ -1,0 +1,71 @@
+"""Progress of a training run on a terminal, or as plain lines in a log."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+# Seconds between two lines where there is no terminal to draw a bar on.
+_LINE_EVERY = 60.0
+
+
+class ProgressBar:
+    """Shows env steps, success, k_max and steps per second.
+
+    Args:
+        total: env steps of the whole run.
+        quiet: show nothing.
+    """
+
+    def __init__(self, total: int, quiet: bool = False):
+        self._quiet = quiet
+        self._total = total
+        self._console = Console(quiet=quiet)
+        self._bar = Progress(
+            TextColumn("{task.completed:,.0f}/{task.total:,.0f} steps"),
+            BarColumn(),
+            TextColumn("{task.fields[figures]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=quiet or not self._console.is_terminal,
+        )
+        self._task = self._bar.add_task("", total=total, figures="")
+        self._last_line = time.monotonic()
+        self._first: tuple[float, int] | None = None
+
+    def __enter__(self) -> ProgressBar:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def say(self, sentence: str) -> None:
+        """Print a sentence above the bar."""
+        self._console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+
+    def update(self, figures: dict[str, Any]) -> None:
+        """Show the figures that `train` reports after each rollout."""
+        now, steps = time.monotonic(), figures["env_steps"]
+        if self._first is None:
+            self._first = (now, steps)
+        since, first_steps = self._first
+        speed = (steps - first_steps) / (now - since) if now > since else 0.0
+        rate, k_max = figures["success_rate"], figures["k_max"]
+        text = "success " + ("-" if rate is None else f"{rate:.2f}")
+        text += "" if k_max is None else f"  k_max {k_max}"
+        text += f"  {speed:,.0f} steps/s"
+        self._bar.update(self._task, completed=min(steps, self._total), figures=text)
+        if not self._console.is_terminal and now - self._last_line >= _LINE_EVERY:
+            self._last_line = now
+            self.say(f"{steps:,}/{self._total:,} steps  {text}")
