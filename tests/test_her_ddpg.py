@@ -1,0 +1,199 @@
+"""What HerDDPG adds to DDPG: each piece alone, and that it learns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_follow_object.envs import make_vec
+from sb3_follow_object.her_ddpg import HerDDPG
+from sb3_follow_object.policies import load_actor, save_actor
+from sb3_follow_object.rollout import run_episodes
+
+from .toy import HORIZON, PointEnv
+
+TINY: dict[str, Any] = {
+    "policy_kwargs": {"net_arch": [32, 32]},
+    "batch_size": 64,
+    "gradient_steps": 10,
+    "train_freq": HORIZON,
+    "gamma": 0.9,
+}
+
+
+def make_model(n_envs: int = 4, **kwargs: Any) -> HerDDPG:
+    env = DummyVecEnv([PointEnv] * n_envs)
+    return HerDDPG("MultiInputPolicy", env, **{**TINY, "seed": 0, **kwargs})
+
+
+def success_rate(model: HerDDPG, n_episodes: int = 100) -> float:
+    env = DummyVecEnv([PointEnv] * 4)
+    env.seed(1000)
+
+    def policy(obs: Any) -> np.ndarray:
+        return model.predict(obs, deterministic=True)[0]
+
+    return run_episodes(policy, env, n_episodes).success_rate
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_learns_to_reach(layer_norm: bool) -> None:
+    model = make_model(policy_kwargs={"net_arch": [64, 64], "critic_layer_norm": layer_norm})
+    before = success_rate(model)
+    model.learn(4000, log_interval=None)  # type: ignore[arg-type]
+    assert before < 0.5
+    assert success_rate(model) > 0.9
+
+
+def test_learns_fetch_reach() -> None:
+    env = make_vec("FetchReach-v4", 2, seed=0)
+    model = HerDDPG("MultiInputPolicy", env, batch_size=128, seed=0)
+    model.learn(1500, log_interval=None)  # type: ignore[arg-type]
+    test_env = make_vec("FetchReach-v4", 2, seed=100)
+    result = run_episodes(lambda obs: model.predict(obs, deterministic=True)[0], test_env, 10)
+    assert result.success_rate >= 0.9
+
+
+def test_targets_lie_in_the_range_of_returns() -> None:
+    model = make_model()
+    assert model._target_bounds() == (pytest.approx(-10.0), 0.0)
+    model.learn(1200, log_interval=None)  # type: ignore[arg-type]
+    data = model.replay_buffer.sample(1000)  # type: ignore[union-attr]
+    with th.no_grad():
+        q = model.critic(data.observations, data.actions)[0]
+    assert q.min() > -11.5 and q.max() < 1.5
+    assert make_model(target_clip=None)._target_bounds() == (-np.inf, np.inf)
+    assert make_model(target_clip=(-3, 1))._target_bounds() == (-3.0, 1.0)
+
+
+def test_targets_are_clipped() -> None:
+    """With every target at the bound the critic learns the bound and nothing else."""
+    model = make_model(target_clip=(-2.0, -2.0), learning_rate=3e-3)
+    model.learn(1200, log_interval=None)  # type: ignore[arg-type]
+    model.train(300, 64)
+    data = model.replay_buffer.sample(500)  # type: ignore[union-attr]
+    with th.no_grad():
+        q = model.critic(data.observations, data.actions)[0]
+    assert float((q + 2.0).abs().mean()) < 0.2
+
+
+def test_action_l2_keeps_actions_small() -> None:
+    sizes = []
+    for weight in (0.0, 10.0):
+        model = make_model(action_l2=weight)
+        model.learn(1200, log_interval=None)  # type: ignore[arg-type]
+        data = model.replay_buffer.sample(500)  # type: ignore[union-attr]
+        with th.no_grad():
+            sizes.append(float(model.actor(data.observations).square().mean()))
+    assert sizes[1] < 0.5 * sizes[0]
+
+
+def test_inputs_are_standardised_by_what_is_stored() -> None:
+    model = make_model()
+    model.learn(1000, log_interval=None)  # type: ignore[arg-type]
+    buffer = model.replay_buffer
+    assert buffer is not None
+    seen = buffer.observations["observation"][: buffer.pos].reshape(-1, 3)
+    for net in (model.actor, model.actor_target, model.critic, model.critic_target):
+        extractor: Any = net.features_extractor
+        np.testing.assert_allclose(extractor.mean[:3], seen.mean(axis=0), atol=1e-3)
+        np.testing.assert_allclose(extractor.std[:3], seen.std(axis=0), rtol=1e-2)
+    features = model.actor.features_extractor(
+        {key: th.full((1, 3), 1e6) for key in ("observation", "achieved_goal", "desired_goal")}
+    )
+    assert features.max() == 5.0
+
+
+def test_exploration_mixes_uniform_actions_and_noise() -> None:
+    model = make_model(n_envs=100, random_action_prob=1.0, noise_std=0.0)
+    model._setup_learn(1000)
+    actions = np.concatenate([model._sample_action(0, None, 100)[1] for _ in range(20)])
+    assert abs(actions.mean()) < 0.05 and abs(actions.std() - 1 / np.sqrt(3)) < 0.02
+    quiet = make_model(n_envs=1, random_action_prob=0.0, noise_std=0.0)
+    quiet._setup_learn(1000)
+    wanted = quiet.predict(quiet._last_obs, deterministic=True)[0]  # type: ignore[arg-type]
+    np.testing.assert_allclose(quiet._sample_action(0, None, 1)[1], wanted, rtol=1e-6)
+
+
+def test_target_networks_move_once_an_interval() -> None:
+    model = make_model(target_update_interval=5, tau=1.0, gradient_steps=4)
+    model.learn(HORIZON * 4, log_interval=None)  # type: ignore[arg-type]
+    live, target = model._trained_parameters()
+    assert any(not th.equal(a, b) for a, b in zip(live, target, strict=True))
+    model.train(1, 64)
+    assert all(th.equal(a, b) for a, b in zip(live, target, strict=True))
+
+
+def test_episodes_of_several_environments() -> None:
+    env = make_vec("FetchReach-v4", 2, seed=0)
+    model = HerDDPG("MultiInputPolicy", env, seed=0, gradient_steps=1, batch_size=8)
+    model.learn(150, log_interval=None)  # type: ignore[arg-type]
+    assert model.num_timesteps == 200  # whole episodes of 50 steps, two at a time
+    assert model.gamma == pytest.approx(0.98)
+    with pytest.raises(ValueError, match="how long its episodes are"):
+        HerDDPG("MultiInputPolicy", DummyVecEnv([PointEnv]))
+
+
+def test_same_seed_same_result() -> None:
+    results = []
+    for seed in (0, 0, 1):
+        model = make_model(seed=seed)
+        model.learn(1000, log_interval=None)  # type: ignore[arg-type]
+        results.append(th.cat([p.detach().ravel() for p in model.actor.parameters()]))
+    assert th.equal(results[0], results[1])
+    assert not th.equal(results[0], results[2])
+
+
+def test_sb3_saves_and_loads_it(tmp_path: Any) -> None:
+    model = make_model()
+    model.learn(400, log_interval=None)  # type: ignore[arg-type]
+    model.save(tmp_path / "model")
+    loaded = HerDDPG.load(tmp_path / "model", env=model.env)
+    obs = model.env.reset()  # type: ignore[union-attr]
+    np.testing.assert_array_equal(
+        model.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
+        loaded.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
+    )
+    loaded.learn(80, log_interval=None)  # type: ignore[arg-type]
+
+
+def test_actor_file_needs_no_training_code(tmp_path: Any) -> None:
+    model = make_model()
+    model.learn(400, log_interval=None)  # type: ignore[arg-type]
+    save_actor(tmp_path / "actor", model.actor, "Point-v0")
+    spaces = model.observation_space, model.action_space
+    actor, env_id = load_actor(tmp_path / "actor", *spaces)  # type: ignore[arg-type]
+    obs = model.env.reset()  # type: ignore[union-attr]
+    assert env_id == "Point-v0"
+    np.testing.assert_array_equal(
+        actor.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
+        model.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
+    )
+    (tmp_path / "actor").write_bytes((tmp_path / "actor").read_bytes()[:-100])
+    with pytest.raises(ValueError, match="not a whole checkpoint"):
+        load_actor(tmp_path / "actor", *spaces)  # type: ignore[arg-type]
+
+
+def test_environment_without_goals_is_refused() -> None:
+    with pytest.raises(ValueError, match="lack achieved_goal, desired_goal, observation"):
+        HerDDPG("MultiInputPolicy", gym.make("Pendulum-v1"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"random_action_prob": 1.5}, "random_action_prob is 1.5; it must lie in"),
+        ({"noise_std": -1.0}, "must be >= 0"),
+        ({"target_update_interval": 0}, "target_update_interval is 0"),
+        ({"policy_kwargs": {"features_extractor_class": object}}, "leave features_extractor"),
+        ({"target_clip": "wide"}, "target_clip is 'wide'"),
+    ],
+)
+def test_bad_arguments(arguments: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        make_model(**arguments)

@@ -1,0 +1,195 @@
+"""The replay buffer draws what HerReplayBuffer draws, and what it adds is as it says."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG, HerReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_follow_object.checkpoint import load_tree, save_tree
+from sb3_follow_object.curriculum import Curriculum
+from sb3_follow_object.her_replay_buffer import FollowObjectReplayBuffer
+from sb3_follow_object.rollout import with_terminal_observations
+from sb3_follow_object.wrappers import ImaginedGoalVecEnv
+
+from .toy import HORIZON, PointEnv, StraightPredictor
+
+
+class LazyPointEnv(PointEnv):
+    """Moves in every second episode only."""
+
+    episodes = 0
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.episodes += 1
+        return super().reset(**kwargs)
+
+    def step(self, action: np.ndarray) -> Any:
+        return super().step(action if self.episodes % 2 else 0.0 * action)
+
+
+def make_env(n_envs: int = 2, env_class: type[PointEnv] = PointEnv) -> DummyVecEnv:
+    env = DummyVecEnv([env_class] * n_envs)
+    env.seed(0)
+    return env
+
+
+def fill(buffers: list[Any], env: Any, n_steps: int, seed: int = 0) -> None:
+    """Give every buffer the same random steps."""
+    rng = np.random.default_rng(seed)
+    obs = env.reset()
+    for _ in range(n_steps):
+        actions = rng.uniform(-1, 1, (env.num_envs, 3)).astype(np.float32)
+        new_obs, rewards, dones, infos = env.step(actions)
+        next_obs = with_terminal_observations(new_obs, dones, infos)
+        for buffer in buffers:
+            buffer.add(dict(obs), dict(next_obs), actions, rewards, dones, infos)
+        obs = new_obs
+
+
+def make_buffer(env: Any, size: int = 2000, **kwargs: Any) -> FollowObjectReplayBuffer:
+    return FollowObjectReplayBuffer(
+        size, env.observation_space, env.action_space, env, "cpu", env.num_envs, seed=0, **kwargs
+    )
+
+
+def as_arrays(samples: Any) -> dict[str, np.ndarray]:
+    return {
+        "obs": samples.observations["observation"].numpy(),
+        "next_achieved": samples.next_observations["achieved_goal"].numpy(),
+        "goal": samples.observations["desired_goal"].numpy(),
+        "next_goal": samples.next_observations["desired_goal"].numpy(),
+        "reward": samples.rewards.numpy().ravel(),
+        "done": samples.dones.numpy().ravel(),
+    }
+
+
+def test_relabelled_reward_is_the_environments() -> None:
+    env = make_env()
+    buffer = make_buffer(env)
+    fill([buffer], env, 100)
+    got = as_arrays(buffer.sample(4000))
+    expected = PointEnv().compute_reward(got["next_achieved"], got["goal"], {})
+    np.testing.assert_array_equal(got["reward"], expected)
+    np.testing.assert_array_equal(got["goal"], got["next_goal"])
+    assert 0.05 < (got["reward"] == 0).mean() < 0.95
+    assert not got["done"].any()  # a truncation is not a termination
+
+
+@pytest.mark.parametrize("strategy", ["future", "final", "episode"])
+def test_same_distribution_as_sb3(strategy: str) -> None:
+    """Means of rewards, goals and goal distances agree within their standard errors."""
+    env = make_env()
+    ours = make_buffer(env, goal_selection_strategy=strategy)
+    theirs = HerReplayBuffer(
+        2000,
+        env.observation_space,
+        env.action_space,
+        env,
+        "cpu",
+        env.num_envs,
+        goal_selection_strategy=strategy,
+    )
+    fill([ours, theirs], env, 205)  # ends in mid-episode: that one must not be drawn
+    np.random.seed(0)
+    a, b = as_arrays(ours.sample(40_000)), as_arrays(theirs.sample(40_000))
+    for name in ("reward", "obs", "goal"):
+        error = np.hypot(a[name].std(axis=0), b[name].std(axis=0)) / np.sqrt(40_000)
+        assert (np.abs(a[name].mean(axis=0) - b[name].mean(axis=0)) <= 4.5 * error).all(), name
+    distance = [np.linalg.norm(x["next_achieved"] - x["goal"], axis=1) for x in (a, b)]
+    for q in (0.1, 0.25, 0.5, 0.75, 0.9):
+        assert np.quantile(distance[0], q) == pytest.approx(np.quantile(distance[1], q), abs=0.006)
+
+
+def test_overwritten_and_unfinished_episodes_are_not_drawn() -> None:
+    env = make_env(n_envs=1)
+    for n_steps in (9, 11, 35, 36, 58, 71):
+        buffer = make_buffer(env, size=35)  # the episode that wraps around overwrites one in part
+        fill([buffer], env, n_steps)
+        if n_steps < HORIZON:
+            with pytest.raises(RuntimeError, match="no finished episode"):
+                buffer.sample(1)
+            continue
+        valid = np.flatnonzero(buffer.ep_length[:, 0] > 0)
+        assert buffer.table.n_transitions() == len(valid)
+        row, step = buffer.table.draw(2000, np.random.default_rng(0))
+        drawn = np.unique((buffer.table.start[row] + step) % 35)
+        np.testing.assert_array_equal(drawn, valid)
+
+
+def test_moved_ratio_draws_episodes_in_which_the_object_moved() -> None:
+    env = make_env(env_class=LazyPointEnv)
+    for ratio, expected in ((0.0, 0.5), (0.5, 0.75), (1.0, 1.0)):
+        buffer = make_buffer(env, moved_ratio=ratio)
+        fill([buffer], env, 20 * HORIZON)
+        assert buffer.moved_share() == 0.5
+        row, _ = buffer._draw(20_000)
+        assert buffer.table.moved[row].mean() == pytest.approx(expected, abs=0.02)
+
+
+def test_imagined_ratio_relabels_with_imagined_goals() -> None:
+    curriculum = Curriculum(HORIZON, k_max=3, p=0.5)
+    env = ImaginedGoalVecEnv(make_env(), StraightPredictor(), curriculum)
+    env.seed(0)
+    buffer = make_buffer(env, imagined_ratio=1.0, n_sampled_goal=10**9)
+    fill([buffer], env, 20 * HORIZON)
+    got = as_arrays(buffer.sample(3000))
+    starts = buffer.observations["achieved_goal"][::HORIZON].reshape(-1, 3)
+    distance = np.linalg.norm(got["goal"][:, None] - starts[None], axis=2)
+    # Levels 1..3 lie 5, 10 and 15 cm from some episode's start.
+    error = np.abs(distance[:, :, None] - np.array([0.05, 0.10, 0.15])).min(axis=(1, 2))
+    assert error.max() < 1e-5
+
+
+def test_imagined_ratio_needs_the_wrapper() -> None:
+    with pytest.raises(ValueError, match="ImaginedGoalVecEnv"):
+        make_buffer(make_env(), imagined_ratio=0.1)
+    with pytest.raises(ValueError, match="must lie in"):
+        make_buffer(make_env(), moved_ratio=1.5)
+
+
+@pytest.mark.parametrize("way", ["pickle", "state_dict"])
+def test_survives_saving_and_loading(way: str, tmp_path: Any) -> None:
+    env = make_env()
+    buffer = make_buffer(env, size=100)
+    fill([buffer], env, 73)
+    if way == "pickle":
+        other = pickle.loads(pickle.dumps(buffer))
+        other.set_env(env)
+    else:
+        save_tree(tmp_path / "buffer", buffer.state_dict())
+        other = make_buffer(env, size=100)
+        other.load_state_dict(load_tree(tmp_path / "buffer"))
+    fill([buffer, other], env, 40, seed=1)
+    expected, got = as_arrays(buffer.sample(500)), as_arrays(other.sample(500))
+    for key in expected:
+        np.testing.assert_array_equal(got[key], expected[key])
+
+
+def test_observations_are_stored_in_float32() -> None:
+    buffer = make_buffer(make_env())
+    stores = [*buffer.observations.values(), *buffer.next_observations.values()]
+    assert {store.dtype for store in stores} == {np.dtype(np.float32)}
+    assert buffer.infos.size == 0
+
+
+def test_works_in_stock_ddpg(tmp_path: Any) -> None:
+    model = DDPG(
+        "MultiInputPolicy",
+        make_env(),
+        replay_buffer_class=FollowObjectReplayBuffer,
+        replay_buffer_kwargs={"moved_ratio": 0.5},
+        learning_starts=2 * HORIZON,
+        train_freq=HORIZON,
+        gradient_steps=2,
+        policy_kwargs={"net_arch": [16]},
+        seed=0,
+    )
+    model.learn(10 * HORIZON)
+    model.save_replay_buffer(tmp_path / "buffer")
+    model.load_replay_buffer(tmp_path / "buffer")
+    model.learn(10 * HORIZON, reset_num_timesteps=False)
