@@ -16,8 +16,10 @@ import gymnasium as gym
 from sb3_follow_object import FollowObject
 
 task = "FollowObject/PushSideGap-v0"
-run = FollowObject(task, n_envs=2, object_timesteps=1600, n_paths=16, predictor_fit={"epochs": 1})
-run.learn(8000)
+small = {"batch_size": 64, "policy_kwargs": {"net_arch": [64]}}
+stages = {"object_timesteps": 800, "n_paths": 16, "predictor_fit": {"epochs": 1}}
+run = FollowObject(task, n_envs=2, algorithm=small, object_algorithm=small, **stages)
+run.learn(2000)
 run.save("saved")
 env = gym.make(task)
 obs, _ = env.reset(seed=0)
