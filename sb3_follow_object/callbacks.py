@@ -152,13 +152,13 @@ class CurriculumCallback(BaseCallback):
 class OriginalGoalEvalCallback(BaseCallback):
     """Evaluate the policy without noise on fresh episodes with original goals.
 
-    Runs at the first end of a rollout after each ``every_steps`` training steps. Records
+    Runs at the first end of a rollout after each ``every_steps`` environment steps. Records
     eval/success_rate, eval/mean_return and eval/env_steps, and appends a row to a CSV file.
 
     Args:
         eval_env: vectorised environment that shows the original goals.
         n_episodes: episodes of an evaluation, >= 1.
-        every_steps: training steps between evaluations, >= 1.
+        every_steps: the model's num_timesteps, tests included, between evaluations, >= 1.
         csv_path: file for the rows; None writes none. A file that holds rows from after the
             loaded state loses those, so that a resumed run repeats none.
         curriculum_callback: its tests are counted in env_steps and its k_max is noted.

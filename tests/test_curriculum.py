@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import toy
 
 from sb3_follow_object.curriculum import Curriculum
 from sb3_follow_object.imagination import draw_goals, imagine, points_along
+
+from . import toy
 
 RNG = np.random.default_rng
 

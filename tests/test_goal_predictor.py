@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-import toy
 
 from sb3_follow_object.files import atomic_write
 from sb3_follow_object.goal_predictor import FACTS_FILE, TENSORS_FILE, GoalPredictor
+
+from . import toy
 
 SMALL: dict[str, Any] = {"env_id": "Toy-v0", "physics": "abc", "hidden": (64, 64)}
 
