@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import sys
+import threading
 from importlib import import_module
 from typing import Any
 
@@ -83,7 +85,7 @@ class Picture:
             self._canvas.close()
             self._canvas = None
         if self._window is not None:
-            self._window.viewer.close()
+            self._window.close()
             self._window = None
 
     def _add_shapes(self, scene: Any, goal: np.ndarray) -> None:
@@ -152,11 +154,22 @@ class _Window:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data = model, mujoco.MjData(model)
+        # Without a screen the viewer does not raise: it ends the process.
+        if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+            raise RuntimeError("No window can be opened without a display; use 'rgb_array'.")
+        running = set(threading.enumerate())
         try:
             self.viewer = import_module("mujoco.viewer").launch_passive(model, self.data)
         except Exception as error:  # no display, or a library of it is missing
             raise RuntimeError(f"No window can be opened here ({error}).") from error
+        self._threads = set(threading.enumerate()) - running
         _point(self.viewer.cam)
+
+    def close(self) -> None:
+        """Close the window and wait: a program that ends meanwhile would crash."""
+        self.viewer.close()
+        for thread in self._threads:
+            thread.join(timeout=5.0)
 
 
 def whole_model(scene: Scene) -> mujoco.MjModel:

@@ -123,10 +123,11 @@ def fetch_spec(task: Task) -> mujoco.MjSpec:
     file = "push.xml" if task.blocked_gripper else "pick_and_place.xml"
     spec = mujoco.MjSpec.from_file(str(_assets() / "fetch" / file))
     table = _child(spec.worldbody.bodies, TABLE)
-    _add_boxes(table, task.obstacles)
+    table.geoms[0].name = TABLE
+    _add_boxes(table, "obstacle", task.obstacles)
     if task.tube:
         tube = spec.worldbody.add_body(name=TUBE, mocap=True, pos=_TUBE_STORE)
-        _add_boxes(tube, task.tube)
+        _add_boxes(tube, TUBE, task.tube)
     return spec
 
 
@@ -261,9 +262,10 @@ def _assets() -> Path:
     return Path(found.origin).parent / "envs" / "assets"
 
 
-def _add_boxes(body: Any, boxes: Iterable[Box]) -> None:
-    for box in boxes:
+def _add_boxes(body: Any, name: str, boxes: Iterable[Box]) -> None:
+    for number, box in enumerate(boxes):
         body.add_geom(
+            name=f"{name}{number}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
             pos=box.centre,
             size=box.half_size,
