@@ -5,7 +5,7 @@ script that goes to the object, pushes or grips it and carries it to the goal; a
 random corner of the action box, which drives the arm into itself and into its limits. Contacts that
 "reachable" leaves out are looked for in the full model after every env step.
 
-    python benchmarks/collision_equality.py                  # writes benchmarks/collision_equality.json
+    python benchmarks/collision_equality.py     # writes collision_equality.json beside itself
     python benchmarks/collision_equality.py --episodes 5 --tasks PnPShelf --output -
 """
 
@@ -21,7 +21,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-
 from sb3_follow_object.envs import TASKS
 from sb3_follow_object.envs.fetch import FetchSimulation
 from sb3_follow_object.envs.scene import fetch_scene
@@ -36,7 +35,7 @@ def random_actions(rng: np.random.Generator, simulation: FetchSimulation, step: 
 
 
 class TouchObject:
-    """Go above or beside the object, down to it, close the fingers, carry or push it to the goal."""
+    """Go above or beside the object, down to it, close the fingers, move to the goal."""
 
     def __call__(
         self, rng: np.random.Generator, simulation: FetchSimulation, step: int

@@ -185,10 +185,12 @@ def object_only(spec: mujoco.MjSpec, body_name: str) -> mujoco.MjSpec:
 
 
 def strip_visuals(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Drop from a spec what physics never reads: cameras, lights, geoms that touch nothing."""
+    """Drop what physics never reads: cameras, lights, geoms that touch nothing, empty bodies."""
     _delete(spec, spec.cameras)
     _delete(spec, spec.lights)
     _delete(spec, (geom for geom in spec.geoms if not geom.contype and not geom.conaffinity))
+    for body in list(spec.worldbody.bodies):
+        _delete_empty(spec, body)
     return spec
 
 
@@ -283,6 +285,16 @@ def _articulated(body: Any) -> bool:
     """Whether a body or one below it has a joint other than a free one."""
     hinged = any(joint.type != mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
     return hinged or any(_articulated(child) for child in body.bodies)
+
+
+def _delete_empty(spec: mujoco.MjSpec, body: Any) -> bool:
+    """Delete the bodies from here down that hold nothing; whether this one was one of them."""
+    kept = [child for child in list(body.bodies) if not _delete_empty(spec, child)]
+    holds = body.joints or body.geoms or body.sites or body.mocap or body.mass > 0
+    if kept or holds:
+        return False
+    spec.delete(body)
+    return True
 
 
 def _names_below(body: Any) -> set[str]:
