@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from .batch import BatchedSimulation
-from .scene import OBJECT, Scene, fetch_spec, object_only
+from .scene import OBJECT, Scene, delete, fetch_spec, object_only
 from .tasks import SUCCESS_DISTANCE, Region, reference_point
 
 SIZE = 480  # pixels, both ways
@@ -176,13 +176,10 @@ def whole_model(scene: Scene) -> mujoco.MjModel:
     """A scene with everything that can be seen; its joints and mocap bodies are the physics'."""
     spec = fetch_spec(scene.task)
     # The goal and what pulls the gripper are marks; the goal's is drawn where the goal is.
-    spec.delete(next(site for site in spec.sites if site.name == "target0"))
-    for geom in list(spec.geoms):
-        if geom.parent.name == "robot0:mocap":
-            spec.delete(geom)
-        elif geom.name == OBJECT:
-            geom.material = ""
-            geom.rgba = _OBJECT_RGBA
+    delete(spec, (site for site in spec.sites if site.name == "target0"))
+    delete(spec, next(b for b in spec.worldbody.bodies if b.name == "robot0:mocap").geoms)
+    (cube,) = (geom for geom in spec.geoms if geom.name == OBJECT)
+    cube.material, cube.rgba = "", _OBJECT_RGBA
     return (object_only(spec, OBJECT) if scene.alone else spec).compile()
 
 

@@ -165,10 +165,10 @@ def object_only(spec: mujoco.MjSpec, body_name: str) -> mujoco.MjSpec:
     ]
     gone_names = {name for child in gone for name in _names_below(child)}
     for group in (spec.keys, spec.sensors, spec.actuators, spec.tendons, spec.equalities):
-        _delete(spec, group)
-    _delete(spec, (x for x in spec.excludes if {x.bodyname1, x.bodyname2} & gone_names))
-    _delete(spec, (x for x in spec.pairs if {x.geomname1, x.geomname2} & gone_names))
-    _delete(spec, gone)
+        delete(spec, group)
+    delete(spec, (x for x in spec.excludes if {x.bodyname1, x.bodyname2} & gone_names))
+    delete(spec, (x for x in spec.pairs if {x.geomname1, x.geomname2} & gone_names))
+    delete(spec, gone)
 
     mocap = f"{body_name}:mocap"
     spec.worldbody.add_body(name=mocap, mocap=True, pos=body.pos, quat=body.quat)
@@ -180,15 +180,15 @@ def object_only(spec: mujoco.MjSpec, body_name: str) -> mujoco.MjSpec:
         solref=[0.02, 1.0],
         solimp=[0.9, 0.95, 0.001, 0.5, 2.0],
     )
-    weld.data[:] = [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]  # same pose, torque scale 1
+    weld.data[:11] = [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]  # same pose, torque scale 1
     return spec
 
 
 def strip_visuals(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     """Drop what physics never reads: cameras, lights, geoms that touch nothing, empty bodies."""
-    _delete(spec, spec.cameras)
-    _delete(spec, spec.lights)
-    _delete(spec, (geom for geom in spec.geoms if not geom.contype and not geom.conaffinity))
+    delete(spec, spec.cameras)
+    delete(spec, spec.lights)
+    delete(spec, (geom for geom in spec.geoms if not geom.contype and not geom.conaffinity))
     for body in list(spec.worldbody.bodies):
         _delete_empty(spec, body)
     return spec
@@ -243,16 +243,16 @@ def _set_up(task: Task, model: mujoco.MjModel) -> Scene:
 
 def _leave_out_unreachable(spec: mujoco.MjSpec) -> None:
     for geom in spec.geoms:
-        part = geom.name.removeprefix("robot0:")
+        part = geom.name.removeprefix("robot0:").rstrip("0123456789")
         if part in _ROBOT_BITS:
             geom.contype, geom.conaffinity = _ROBOT_BITS[part]
         elif part in _NEVER_TOUCHED:
             geom.contype, geom.conaffinity = 0, 0
-        elif part == OBJECT:
+        elif part == "object":
             geom.contype, geom.conaffinity = _OBJECT_BIT, _FLOOR | _STANDING
-        elif part == "floor0":
+        elif part == "floor":
             geom.contype, geom.conaffinity = _FLOOR, 0
-        elif geom.parent.name in (TABLE, TUBE):
+        elif part in ("table", "obstacle", "tube"):
             geom.contype, geom.conaffinity = _STANDING, 0
 
 
@@ -293,7 +293,7 @@ def _delete_empty(spec: mujoco.MjSpec, body: Any) -> bool:
     holds = body.joints or body.geoms or body.sites or body.mocap or body.mass > 0
     if kept or holds:
         return False
-    spec.delete(body)
+    delete(spec, [body])
     return True
 
 
@@ -303,6 +303,12 @@ def _names_below(body: Any) -> set[str]:
     return names.union(*(_names_below(child) for child in body.bodies))
 
 
-def _delete(spec: mujoco.MjSpec, elements: Iterable[Any]) -> None:
+def delete(spec: mujoco.MjSpec, elements: Iterable[Any]) -> None:
+    """Delete elements of a spec."""
     for element in list(elements):
-        spec.delete(element)
+        if hasattr(spec, "delete"):
+            spec.delete(element)
+        elif isinstance(element, mujoco.MjsBody):  # mujoco before 3.3.3, as below
+            spec.detach_body(element)
+        else:
+            element.delete()
