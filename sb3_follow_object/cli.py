@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
 
 PROGRAM = "sb3-follow-object"
 USER_ERROR, INTERRUPTED = 2, 130
+CURVE, VIDEO = "curve.png", "video.mp4"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -36,11 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if argv is None else list(argv)
     args = _parser().parse_args(arguments)
     args.command_line = shlex.join([PROGRAM, *arguments])
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # must stand before mujoco is imported
     try:
         args.run_command(args)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         print(f"{PROGRAM}: {' '.join(str(error).split())}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:
@@ -79,6 +77,25 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--episodes", type=int, default=380, metavar="N", help="default: 380")
     evaluate.add_argument("--seed", type=int, metavar="N", help="of the episodes; default: run's")
     evaluate.add_argument("--json", action="store_true", help="print one JSON object")
+
+    watch = commands.add_parser("watch", help="film a run's policy")
+    watch.set_defaults(run_command=_watch)
+    watch.add_argument("run", type=Path, help="folder with policy.safetensors and config.json")
+    watch.add_argument("--episodes", type=int, default=5, metavar="N", help="default: 5")
+    watch.add_argument("--seed", type=int, default=0, metavar="N", help="of the episodes")
+    watch.add_argument("--out", type=Path, metavar="FILE.mp4", help=f"default: RUN/{VIDEO}")
+
+    plot = commands.add_parser("plot", help="draw success and k_max of one or several runs")
+    plot.set_defaults(run_command=_plot)
+    plot.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run folders")
+    plot.add_argument(
+        "--out", type=Path, metavar="FILE.png", help=f"default: RUN/{CURVE}, or of several {CURVE}"
+    )
+
+    predictor = commands.add_parser("predictor", help="learn F_phi alone, stages one and two")
+    predictor.set_defaults(run_command=_predictor, method="fo")
+    predictor.add_argument("--out", type=Path, required=True, metavar="FOLDER")
+    _add_settings(predictor)
     return parser
 
 
@@ -114,10 +131,39 @@ def _train(args: argparse.Namespace) -> None:
             progress=bar.update,
             command=args.command_line,
         )
+        _illustrate(args.run, config, bar.say)
     if not args.quiet:
-        row = {name: result[name] for name in ("task", "method", "seed", "env_steps")}
-        row |= {"minutes": result["wall_s"] / 60.0, "k_max": result["k_max"]}
-        _print_table(row | {name: result[name] for name in ("episodes", "success_rate")})
+        row = {name: result[name] for name in ("task", "method", "seed", "k_max")}
+        row |= {"env steps": f"{result['env_steps']:,}", "minutes": result["wall_s"] / 60.0}
+        _print_table({**row, "success": f"{result['success_rate']:.3f} of {result['episodes']}"})
+
+
+def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> None:
+    """Draw what a finished run folder has no picture of yet; say what could not be drawn."""
+    from .experiment import POLICY, PREDICTOR
+    from .goal_predictor import GoalPredictor
+    from .pictures import draw_imagined, draw_task, record
+    from .plots import draw_curves
+
+    env_id = config.env_id
+    makers: dict[str, Callable[[Path], Any]] = {
+        CURVE: lambda out: draw_curves([run], out),
+        "task.png": lambda out: draw_task(env_id, out),
+    }
+    if (run / PREDICTOR).exists():
+        predictor = GoalPredictor.load(run / PREDICTOR, env_id=env_id)
+        makers["imagined.png"] = lambda out: draw_imagined(env_id, predictor, out)
+    makers[VIDEO] = lambda out: record(run / POLICY, env_id, out)
+    failed: dict[str, list[str]] = {}
+    for name, make in makers.items():
+        if (run / name).exists():
+            continue
+        try:
+            make(run / name)
+        except Exception as error:  # graphics drivers raise anything; the run itself is done
+            failed.setdefault(" ".join(str(error).split()), []).append(name)
+    for reason, names in failed.items():
+        say(f"left out {', '.join(names)}: {reason}")
 
 
 def _config(args: argparse.Namespace) -> RunConfig:
@@ -180,6 +226,39 @@ def _evaluate(args: argparse.Namespace) -> None:
         print(json.dumps(result))
     else:
         _print_table(result)
+
+
+def _watch(args: argparse.Namespace) -> None:
+    from .config import load_config
+    from .experiment import POLICY
+    from .pictures import record
+
+    config = load_config(args.run)
+    out = args.out or args.run / VIDEO
+    rate = record(args.run / POLICY, config.env_id, out, args.episodes, args.seed)
+    print(f"{out}: {args.episodes} episodes, success {rate:.2f}")
+
+
+def _plot(args: argparse.Namespace) -> None:
+    from .plots import draw_curves
+
+    out = args.out or (args.runs[0] / CURVE if len(args.runs) == 1 else Path(CURVE))
+    draw_curves(args.runs, out)
+    print(out)
+
+
+def _predictor(args: argparse.Namespace) -> None:
+    import torch as th
+
+    from .predictors import learn_predictor
+
+    args.steps = args.n_envs = args.threads = None
+    config = _config(args)
+    if args.out.exists() and not (args.out.is_dir() and not any(args.out.iterdir())):
+        raise ValueError(f"{args.out} is not empty; give another folder")
+    th.set_num_threads(config.torch_threads)
+    learn_predictor(config, args.out)
+    print(args.out)
 
 
 def _print_table(row: dict[str, Any]) -> None:

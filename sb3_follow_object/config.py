@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stderr
 from importlib import import_module
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,8 @@ from .policies import HerPolicy
 
 METHODS = ("fo", "her")
 PRESETS = ("default", "paper")
+
+_GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 WRAPPER = "sb3_follow_object.ImaginedGoalWrapper"
 CALLBACK = "sb3_follow_object.CurriculumCallback"
@@ -54,7 +59,7 @@ def run_config(
     *,
     method: str | None = None,
     preset: str = "default",
-    file: str | Path | None = None,
+    file: str | os.PathLike[str] | None = None,
     seed: int = 0,
     overrides: Mapping[str, Any] | None = None,
 ) -> RunConfig:
@@ -71,7 +76,7 @@ def run_config(
     Raises:
         ValueError: an id, a file, a key or a value that cannot be meant, with the nearest that can.
     """
-    check_id(env_id)
+    check_task(env_id)
     if file is None:
         method = method or "fo"
         path = preset_file(method, preset)
@@ -86,9 +91,14 @@ def run_config(
             f"{path} trains {env_id} with method {found!r}, not {method!r}: only entries with "
             f"env_wrapper {WRAPPER} imagine goals"
         )
+    if imagine and env_id not in IDS:
+        raise ValueError(
+            f"{env_id!r} has no environment of its object alone, which imagined goals come from; "
+            f"train it with --method her, or one of {', '.join(sorted(IDS))}"
+        )
     settings = _flattened(entry, path)
-    if imagine and env_id in IDS and object_id(env_id) in entries:
-        alone = dict(_entry(entries, object_id(env_id), path))
+    if imagine and object_id(env_id) in entries:
+        alone = _plain(_entry(entries, object_id(env_id), path))
         alone.pop("policy", None)  # rl_zoo3 wants it; the first stage knows only one
         if "n_timesteps" in alone:
             settings["object_timesteps"] = alone.pop("n_timesteps")
@@ -117,7 +127,7 @@ def run_config(
     )
 
 
-def load_config(folder: str | Path) -> RunConfig:
+def load_config(folder: str | os.PathLike[str]) -> RunConfig:
     """Return the configuration that a run folder was started with.
 
     Raises:
@@ -126,10 +136,11 @@ def load_config(folder: str | Path) -> RunConfig:
     path = Path(folder) / CONFIG
     try:
         saved = json.loads(path.read_text())
+        _registered(saved["env_id"])
         return RunConfig(**{**saved, "settings": _with_tuples(saved["settings"])})
     except FileNotFoundError as error:
         raise ValueError(f"{folder} holds no run: there is no {path}") from error
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not the configuration of a run ({error})") from error
 
 
@@ -146,20 +157,45 @@ def parse_override(text: str) -> tuple[str, Any]:
         parsed = yaml.safe_load(value)
     except yaml.YAMLError as error:
         raise ValueError(f"the value of {text!r} is not YAML") from error
-    return name, _number(parsed)
+    return name, _plain(parsed)
 
 
-def check_id(env_id: str) -> None:
-    """Raise a ValueError that names the nearest id unless gymnasium knows this one."""
+def check_task(env_id: str) -> None:
+    """Raise a ValueError unless gymnasium knows the id and a robot can pursue goals there."""
+    name = _registered(env_id)
+    if name not in gym.registry:
+        near = did_you_mean(name, [*IDS, *gym.registry])
+        raise ValueError(f"there is no environment {env_id!r}{near}")
+    if name in IDS:
+        return
+    try:
+        env = gym.make(name)
+    except gym.error.Error as error:
+        raise ValueError(f"{env_id!r} cannot be made: {error}") from error
+    try:
+        missing = set(_GOAL_KEYS) - set(getattr(env.observation_space, "spaces", {}))
+        if missing:
+            raise ValueError(
+                f"{env_id!r} has no goals: its observations lack {', '.join(sorted(missing))}"
+            )
+        if env.spec is None or env.spec.max_episode_steps is None:
+            raise ValueError(f"{env_id!r} does not say how long its episodes are")
+    finally:
+        env.close()
+
+
+def _registered(env_id: str) -> str:
+    """Import the module that may register an id and return the id without the module's name."""
     module, _, name = env_id.rpartition(":")
     if module:
         try:
             import_module(module)
         except ImportError as error:
             raise ValueError(f"{env_id!r} names a module that cannot be imported") from error
-    if name not in gym.registry:
-        near = did_you_mean(name, [*IDS, *gym.registry])
-        raise ValueError(f"there is no environment {env_id!r}{near}")
+    elif name not in gym.registry:
+        with redirect_stderr(StringIO()):  # it speaks of other environments' versions
+            import_module("gymnasium_robotics")
+    return name
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -211,7 +247,7 @@ def _named(entry: dict[str, Any], key: str, path: Path) -> dict[str, dict[str, A
 
 def _flattened(entry: dict[str, Any], path: Path) -> dict[str, Any]:
     """Return an entry with the arguments of its wrapper, callback and environments as settings."""
-    settings = json.loads(json.dumps(entry))  # anchors share what overrides are about to change
+    settings = _plain(entry)
     for arguments in _named(settings, "env_wrapper", path).values():
         _check_names(arguments, ("predictor", "curriculum"), f"{path}: {WRAPPER}")
         if arguments.get("predictor", "auto") != "auto":
@@ -302,9 +338,13 @@ def _fits(value: Any, default: Any) -> bool:
     return not isinstance(default, str) or isinstance(value, str)
 
 
-def _number(value: Any) -> Any:
-    """Read 1e-3 as the number that YAML 1.1 takes for a word."""
-    if not isinstance(value, str):
+def _plain(value: Any) -> Any:
+    """Read 1e-3, a word in YAML 1.1, as a number, and !!float 1e6 as the whole one it is."""
+    if isinstance(value, dict):
+        return {name: _plain(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_plain(inner) for inner in value]
+    if not isinstance(value, str | float):
         return value
     try:
         number = float(value)

@@ -33,8 +33,8 @@ from .rollout import Episodes, run_episodes
 CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
 CHECKPOINT, PREDICTOR = "checkpoint.safetensors", "predictor"
 POLICY, LAST_POLICY = "policy.safetensors", "last_policy.safetensors"
-PACKAGES = ("sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics")
-PACKAGES += ("mujoco", "torch", "numpy")
+PACKAGES = ["sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics"]
+PACKAGES += ["mujoco", "torch", "numpy"]
 
 # Evaluation copies: the paper's 380 episodes are ten from each.
 _EVAL_COPIES = 38
@@ -279,7 +279,7 @@ def evaluate(
         space = env.observation_space
         actor, _ = load_actor(policy_file, space, env.action_space)  # type: ignore[arg-type]
         return run_episodes(
-            lambda obs: actor.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
+            lambda obs: actor.predict(obs, deterministic=True)[0],
             env,
             n_episodes,
         )

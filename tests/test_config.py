@@ -1,0 +1,209 @@
+"""Settings: what the shipped files say, what rl_zoo3 reads in them, and what is refused."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from sb3_follow_object.envs import IDS
+
+from sb3_follow_object.config import (
+    CALLBACK,
+    METHODS,
+    PRESETS,
+    WRAPPER,
+    load_config,
+    parse_override,
+    preset_file,
+    run_config,
+)
+from sb3_follow_object.her_ddpg import HerDDPG
+
+TASK = "FollowObject/PushSideGap-v0"
+ROBOTS = [env_id for env_id, (_, alone) in IDS.items() if not alone]
+FILES = [preset_file(method, preset) for method in METHODS for preset in PRESETS]
+
+
+def write(path: Path, entry: dict[str, Any], env_id: str = TASK) -> Path:
+    path.write_text(yaml.safe_dump({env_id: entry}))
+    return path
+
+
+def imagining(**curriculum: Any) -> dict[str, Any]:
+    return {"env_wrapper": [{WRAPPER: {"predictor": "auto", "curriculum": curriculum}}]}
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("env_id", ROBOTS)
+def test_every_task_has_settings_in_every_preset(env_id: str, method: str, preset: str) -> None:
+    config = run_config(env_id, method=method, preset=preset, seed=3)
+    assert (config.env_id, config.method, config.seed) == (env_id, method, 3)
+    assert config.settings["imagine"] == (method == "fo")
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_rl_zoo3_can_build_the_algorithm_from_every_entry(file: Path) -> None:
+    """Besides its own keys it hands an entry to the algorithm as keyword arguments."""
+    known = {*inspect.signature(HerDDPG.__init__).parameters}
+    for env_id, entry in yaml.safe_load(file.read_text()).items():
+        assert env_id == "default" or env_id in IDS or env_id.startswith("Fetch")
+        own = {"n_timesteps", "n_envs", "env_wrapper", "callback"}
+        assert {"n_timesteps", "policy"} <= set(entry)
+        assert set(entry) - own <= known
+
+
+def test_paper_preset_is_the_authors_setting() -> None:
+    config = run_config(TASK, preset="paper")
+    algorithm = config.settings["algorithm"]
+    assert config.settings["n_envs"] == config.settings["n_test_episodes"] == 38
+    assert algorithm["batch_size"] == 38 * 128
+    assert (algorithm["gradient_steps"], algorithm["target_update_interval"]) == (40, 40)
+    assert algorithm["tau"] == 0.05
+    assert algorithm["replay_buffer_kwargs"]["moved_ratio"] == 0.0
+    assert not algorithm["policy_kwargs"]["critic_layer_norm"]
+    curriculum = config.settings["curriculum"]
+    assert (curriculum["levels"], curriculum["k_max"], curriculum["p"]) == ("time", 2, 0.2)
+    assert not config.settings["store_tests"]
+    assert config.settings["object_timesteps"] == 25 * 95_000
+    double = run_config("FollowObject/PushDoubleObstacles-v0", preset="paper")
+    assert double.settings["object_timesteps"] == 50 * 152_000
+
+
+def test_her_differs_from_fo_by_its_imagined_goals_alone() -> None:
+    for preset in PRESETS:
+        fo = run_config(TASK, method="fo", preset=preset).settings
+        her = run_config(TASK, method="her", preset=preset).settings
+        assert fo["algorithm"] == her["algorithm"]
+        assert fo["n_envs"] == her["n_envs"]
+
+
+def test_wrapper_and_callback_become_settings(tmp_path: Path) -> None:
+    entry = imagining(p=0.5, levels="path")
+    entry |= {"callback": [{CALLBACK: {"every": 3, "n_episodes": 8, "store": False}}]}
+    entry |= {"n_timesteps": "1e5", "batch_size": 64, "train_freq": [2, "episode"]}
+    entry |= {"env_kwargs": {"reward_type": "dense"}, "n_envs": 4}
+    config = run_config(TASK, file=write(tmp_path / "my.yml", entry))
+    assert config.method == "fo"
+    assert config.total_timesteps == 100_000
+    assert config.settings == {
+        "imagine": True,
+        "curriculum": {"p": 0.5, "levels": "path"},
+        "test_every": 3,
+        "n_test_episodes": 8,
+        "store_tests": False,
+        "reward_type": "dense",
+        "n_envs": 4,
+        "algorithm": {"batch_size": 64, "train_freq": (2, "episode")},
+    }
+
+
+def test_file_without_imagined_goals_is_her(tmp_path: Path) -> None:
+    file = write(tmp_path / "my.yml", {"n_envs": 2})
+    assert run_config(TASK, file=file).method == "her"
+    with pytest.raises(ValueError, match=r"trains .* with method 'her', not 'fo'"):
+        run_config(TASK, file=file, method="fo")
+
+
+def test_overrides_win_and_leave_the_shared_anchors_alone() -> None:
+    changed = run_config(TASK, overrides={"curriculum.p": 0.7, "batch_size": 8})
+    plain = run_config(TASK)
+    assert changed.settings["curriculum"] == plain.settings["curriculum"] | {"p": 0.7}
+    assert "p" not in plain.settings["curriculum"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("learning_rate=1e-3", ("learning_rate", 0.001)),
+        ("n_timesteps=1e6", ("n_timesteps", 1_000_000)),
+        ("policy_kwargs.net_arch=[8, 8]", ("policy_kwargs.net_arch", [8, 8])),
+        ("store_tests=false", ("store_tests", False)),
+        ("gamma=null", ("gamma", None)),
+        ("curriculum.levels=path", ("curriculum.levels", "path")),
+    ],
+)
+def test_override_is_read_as_yaml(text: str, expected: tuple[str, Any]) -> None:
+    assert parse_override(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("env_id", "overrides", "sentence"),
+    [
+        ("FollowObject/PnPShelv-v0", {}, "did you mean 'FollowObject/PnPShelf-v0'"),
+        ("CartPole-v1", {}, "'CartPole-v1' has no goals: its observations lack achieved_goal"),
+        ("no_module:Task-v0", {}, "names a module that cannot be imported"),
+        ("FetchPush-v4", {}, "has no settings for 'FetchPush-v4'"),
+        (TASK, {"batchsize": 1}, "--set has no setting 'batchsize'; did you mean 'batch_size'"),
+        (TASK, {"curriculum.kmax": 1}, "--set: curriculum has no setting 'kmax'"),
+        (TASK, {"policy_kwargs.layernorm": 1}, "policy_kwargs has no setting 'layernorm'"),
+        (TASK, {"object_algorithm.tao": 1}, "object_algorithm has no setting 'tao'"),
+        (TASK, {"batch_size": "many"}, "batch_size must be like 512, not 'many'"),
+        (TASK, {"batch_size": 0}, "batch_size is 0; it must be at least 1"),
+        (TASK, {"curriculum": 3}, "curriculum must be a mapping, not 3"),
+        (TASK, {"store_tests": 1}, "store_tests must be true or false, not 1"),
+        (TASK, {"eval_every": 0}, "eval_every is 0; it must be at least 1"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(
+    env_id: str, overrides: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ValueError) as refusal:
+        run_config(env_id, overrides=overrides)
+    assert sentence in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("[1, 2]", "is not a mapping from environment ids"),
+        ("{a: [", "is not YAML"),
+        (f"{TASK}: 3", "are not a mapping"),
+        (f"{TASK}: {{batchsize: 3}}", "my.yml has no setting 'batchsize'; did you mean"),
+        (f"{TASK}: {{env_wrapper: other.Wrapper}}", "not 'other.Wrapper'"),
+        (f"{TASK}: {{callback: [3]}}", "callback must list class names"),
+        (
+            f"{TASK}: {{env_wrapper: [{{{WRAPPER}: {{curiculum: 1}}}}]}}",
+            "did you mean 'curriculum'",
+        ),
+        (f"{TASK}: {{env_wrapper: [{{{WRAPPER}: {{predictor: x}}}}]}}", "makes its own predictor"),
+        (f"{TASK}: {{env_kwargs: {{colour: 1}}}}", "env_kwargs has no setting 'colour'"),
+        (f"!!python/object/apply:os.system ['x']\n{TASK}: 3", "is not YAML"),
+    ],
+)
+def test_file_that_cannot_be_meant_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
+    file = tmp_path / "my.yml"
+    file.write_text(text)
+    with pytest.raises(ValueError) as refusal:
+        run_config(TASK, file=file)
+    assert sentence in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="cannot be read: No such file"):
+        run_config(TASK, file=tmp_path / "none.yml")
+
+
+def test_imagined_goals_need_an_object_of_its_own(tmp_path: Path) -> None:
+    file = write(tmp_path / "my.yml", imagining(), "FetchPush-v4")
+    with pytest.raises(ValueError, match="has no environment of its object alone"):
+        run_config("FetchPush-v4", file=file)
+
+
+def test_run_folder_keeps_the_configuration(tmp_path: Path) -> None:
+    config = run_config(TASK, overrides={"train_freq": [1, "episode"], "n_eval_episodes": 5})
+    (tmp_path / "config.json").write_text(json.dumps(asdict(config)))
+    assert load_config(tmp_path) == config
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"env_id": "x"}', '{"env_id": "x", "settings": 1}'])
+def test_damaged_configuration_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(ValueError, match="is not the configuration of a run"):
+        load_config(tmp_path)
