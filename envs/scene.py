@@ -42,7 +42,7 @@ COLLISIONS = ("reachable", "full")
 # pair of a robot part with floor, table, obstacles, tube or object, and of the arm with the trunk
 # (the shoulder rubs against the torso when the gripper is far out, and leaving that out changes
 # where the gripper goes). Left out are links of the arm against each other, except for the hand
-# against the upper arm, and the three parts named last, whose geoms leave the physics model.
+# against the upper arm, and the three parts named last.
 _FLOOR, _STANDING, _OBJECT_BIT, _TRUNK, _UPPER_ARM = 1, 2, 4, 8, 16
 _WORLD = _FLOOR | _STANDING | _OBJECT_BIT
 _ROBOT_BITS = {
@@ -185,10 +185,13 @@ def object_only(spec: mujoco.MjSpec, body_name: str) -> mujoco.MjSpec:
 
 
 def strip_visuals(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Drop what physics never reads: cameras, lights, geoms that touch nothing, empty bodies."""
+    """Drop what physics never reads: cameras, lights and bodies that hold nothing.
+
+    Geoms that touch nothing stay: mujoco lays the axes of its coarse collision test through all
+    geoms, and from those follows whether a contact at the edge of its margin is seen.
+    """
     delete(spec, spec.cameras)
     delete(spec, spec.lights)
-    delete(spec, (geom for geom in spec.geoms if not geom.contype and not geom.conaffinity))
     for body in list(spec.worldbody.bodies):
         _delete_empty(spec, body)
     return spec
