@@ -231,6 +231,7 @@ class BatchVecEnv(_GoalFace, VecEnv):
         return {
             **self.simulation.get_state(),
             "generators": [generator.bit_generator.state for generator in self._generators],
+            "seeds": list(self._seeds),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -242,6 +243,7 @@ class BatchVecEnv(_GoalFace, VecEnv):
         self.simulation.set_state(state)
         for generator, saved in zip(self._generators, state["generators"], strict=True):
             generator.bit_generator.state = saved
+        self._seeds = list(state["seeds"])  # those that the next reset() would still use
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """A picture (480, 480, 3) of every copy."""

@@ -18,11 +18,15 @@ class ObjectSimulation(BatchedSimulation):
 
     action_size = 7
     observation_size = 12
+    on_table = False
 
     def control(self, actions: np.ndarray) -> None:
         """Pull the object off its pose by 0.05 times the action."""
         self._target_pos[:] = self.read["welded_pos"] + actions[:, :3] * MAX_DISPLACEMENT
         self._target_quat[:] = self.read["welded_quat"] + actions[:, 3:] * MAX_DISPLACEMENT
+        if self.on_table:
+            self._target_pos[:, 2] = self.scene.landmarks.rest_height
+            self._target_quat[:, 1:3] = 0.0  # upright: turned about the vertical only
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
         """Position, Euler angles, linear and angular velocity (n_envs, 12), and positions."""
@@ -40,6 +44,8 @@ class ObjectEnv(SingleEnv):
 
     Args:
         task: key in `TASKS`, or a row of one's own.
+        on_table: whether the object may not leave the table, so that its paths are those of an
+            object that is pushed. The paper's object may.
         reward_type: "sparse" (0 within 0.05 m of the goal, else -1) or "dense" (minus metres).
         render_mode: None, "rgb_array" or "human".
         show_regions: draw where start and goal come from.
@@ -49,22 +55,26 @@ class ObjectEnv(SingleEnv):
     """
 
     simulation_type = ObjectSimulation
+    simulation: ObjectSimulation
 
     def __init__(
         self,
         task: str | Task,
         *,
+        on_table: bool = False,
         reward_type: RewardType = "sparse",
         render_mode: str | None = None,
         show_regions: bool = False,
     ) -> None:
         self._arguments: dict[str, Any] = {
             "task": task,
+            "on_table": on_table,
             "reward_type": reward_type,
             "render_mode": render_mode,
             "show_regions": show_regions,
         }
         self._set_up(object_scene(find_task(task)), reward_type, render_mode, show_regions)
+        self.simulation.on_table = on_table
 
 
 class ObjectVecEnv(BatchVecEnv):
@@ -75,13 +85,14 @@ class ObjectVecEnv(BatchVecEnv):
         n_envs: number of copies, at least 1.
         n_threads: threads that step them; None takes one a processor.
         seed: copy i draws what `ObjectEnv.reset(seed=seed + i)` draws; None is random.
-        reward_type, render_mode, show_regions: as in `ObjectEnv`.
+        on_table, reward_type, render_mode, show_regions: as in `ObjectEnv`.
 
     Raises:
         ValueError: an unknown id or option, or a number below 1.
     """
 
     simulation_type = ObjectSimulation
+    simulation: ObjectSimulation
 
     def __init__(
         self,
@@ -90,6 +101,7 @@ class ObjectVecEnv(BatchVecEnv):
         n_threads: int | None = None,
         *,
         seed: int | None = None,
+        on_table: bool = False,
         reward_type: RewardType = "sparse",
         render_mode: str | None = None,
         show_regions: bool = False,
@@ -103,3 +115,4 @@ class ObjectVecEnv(BatchVecEnv):
             render_mode=render_mode,
             show_regions=show_regions,
         )
+        self.simulation.on_table = on_table
