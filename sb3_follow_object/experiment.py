@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -204,7 +205,7 @@ def train(
     elif saved is None:  # stopped before the first checkpoint: what was evaluated begins anew
         (folder / EVALUATIONS).unlink(missing_ok=True)
     stage_file = folder / "object_stage.json"
-    if saved is None and predictor is not None and stage_file.exists():
+    if predictor is not None and stage_file.exists():
         stage = json.loads(stage_file.read_text())
         run.object_steps, run.object_success = stage["object_steps"], stage["object_success"]
 
@@ -298,6 +299,18 @@ def trained_steps(folder: str | os.PathLike[str]) -> int | None:
     return None
 
 
+def source_commit() -> str | None:
+    """Return the commit of the package's source tree; None for an installed wheel."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        run = subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return run.stdout.strip()
+
+
 def _check_folder(folder: Path, config: RunConfig, resume: bool) -> None:
     """Raise unless the folder is this run's or, where one starts, absent or empty."""
     if not resume:
@@ -349,6 +362,7 @@ def _claim(folder: Path, config: RunConfig) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
     versions["python"] = platform.python_version()
+    versions["commit"] = source_commit()
     atomic_write(folder / "versions.json", json.dumps(versions, indent=2).encode())
     atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from .callbacks import CurriculumCallback
 from .checkpoint import load_tree, save_tree
 from .curriculum import Curriculum
-from .envs import make_vec, object_id, physics_id
+from .envs import IDS, make_vec, object_id, physics_id
 from .files import atomic_write
 from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
@@ -60,6 +60,9 @@ class FollowObject:
         algorithm: keyword arguments of the robot's `HerDDPG`.
         curriculum: keyword arguments of `Curriculum` besides the horizon.
         object_algorithm: keyword arguments of the object's `HerDDPG`.
+        object_on_table: whether the object may not leave the table in the first stage; by default
+            where the gripper is blocked (Push tasks), so that the imagined goals can be reached by
+            pushing. The paper's object may always leave it.
         object_timesteps: env steps after which the object stage gives up.
         n_paths: noise-free object paths that F_phi is fitted on.
         predictor_fit: keyword arguments of `GoalPredictor.fit`.
@@ -90,10 +93,11 @@ class FollowObject:
         algorithm: dict[str, Any] | None = None,
         curriculum: dict[str, Any] | None = None,
         object_algorithm: dict[str, Any] | None = None,
+        object_on_table: bool | None = None,
         object_timesteps: int = 400_000,
-        n_paths: int = 1024,
+        n_paths: int = 512,
         predictor_fit: dict[str, Any] | None = None,
-        test_every: int = 1,
+        test_every: int = 2,
         n_test_episodes: int | None = None,
         store_tests: bool = True,
         seed: int = 0,
@@ -108,6 +112,7 @@ class FollowObject:
             "algorithm": dict(algorithm or {}),
             "curriculum": dict(curriculum or {}),
             "object_algorithm": dict(object_algorithm or {}),
+            "object_on_table": object_on_table,
             "object_timesteps": object_timesteps,
             "n_paths": n_paths,
             "predictor_fit": dict(predictor_fit or {}),
@@ -359,7 +364,12 @@ class FollowObject:
         return env
 
     def _object_env(self, purpose: str) -> VecEnv:
-        env = make_vec(object_id(self.env_id), _OBJECT_COPIES, self.settings["n_threads"])
+        on_table = self.settings["object_on_table"]
+        if on_table is None:
+            on_table = IDS[self.env_id][0].blocked_gripper
+        env = make_vec(
+            object_id(self.env_id), _OBJECT_COPIES, self.settings["n_threads"], on_table=on_table
+        )
         env.seed(stream_seed(self.seed, purpose))
         return env
 
