@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
-from tree import run
+from tree import ROOT, run
 
 pytestmark = pytest.mark.xdist_group("wheel")
 
@@ -62,3 +62,7 @@ def test_environments_run_at_both_ends_of_the_range(
     python = bare_python(tmp_path / "venv", wanted)
     output = run([str(python), "-I", "-c", SMOKE], cwd=tmp_path)
     assert output.splitlines()[-1] in Requirement(wanted).specifier
+    # importlib: the tests must meet the installed package, not the tree beside them.
+    pytest_here = [str(python), "-I", "-m", "pytest", "-q", "--import-mode=importlib"]
+    parity = [str(ROOT / "tests" / "test_physics.py"), "-k", "parity", "-p", "no:cacheprovider"]
+    assert "2 passed" in run([*pytest_here, *parity], cwd=tmp_path)

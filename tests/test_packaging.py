@@ -57,10 +57,14 @@ def python(tmp_path_factory: pytest.TempPathFactory, bare_python: Callable[..., 
     return bare_python(tmp_path_factory.mktemp("user") / "venv")
 
 
-def test_installed_package_is_not_the_tree(python: Path, tmp_path: Path) -> None:
-    code = "import sb3_follow_object; print(sb3_follow_object.__file__)"
-    file = run([str(python), "-I", "-c", code], cwd=tmp_path).strip()
+def test_installed_package_is_not_the_tree_and_is_light_to_import(
+    python: Path, tmp_path: Path
+) -> None:
+    code = "import sys, sb3_follow_object; print(sb3_follow_object.__file__, *sys.modules)"
+    file, *modules = run([str(python), "-I", "-c", code], cwd=tmp_path).split()
     assert Path(file).is_relative_to(python.parents[1])
+    # mujoco reads MUJOCO_GL when it is imported, so a program must be able to set it after us.
+    assert not {"torch", "mujoco"} & set(modules)
 
 
 @pytest.mark.parametrize("script", [MAKE_BY_MODULE, USER_SCRIPT], ids=["make", "learn"])
