@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return USER_ERROR
     except KeyboardInterrupt:
         hint = "interrupted"
-        if args.run_command is _train:
+        if args.run_command is _train and args.run.exists():
             hint += f"; go on with: {PROGRAM} train --resume --run {shlex.quote(str(args.run))}"
         print(f"{PROGRAM}: {hint}", file=sys.stderr)
         return INTERRUPTED
