@@ -98,11 +98,7 @@ def run_config(
         )
     settings = _flattened(entry, path)
     if imagine and object_id(env_id) in entries:
-        alone = _plain(_entry(entries, object_id(env_id), path))
-        alone.pop("policy", None)  # rl_zoo3 wants it; the first stage knows only one
-        if "n_timesteps" in alone:
-            settings["object_timesteps"] = alone.pop("n_timesteps")
-        settings["object_algorithm"] = alone
+        settings |= _object_stage(_entry(entries, object_id(env_id), path), path)
     schema = _schema()
     changes: dict[str, Any] = {}
     for name, value in (overrides or {}).items():
@@ -264,6 +260,18 @@ def _flattened(entry: dict[str, Any], path: Path) -> dict[str, Any]:
         for name, value in settings.items()
         if name not in ("env_wrapper", "callback", "env_kwargs")
     }
+
+
+def _object_stage(entry: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the first stage's settings from the entry of the object's own environment."""
+    algorithm = _plain(entry)
+    algorithm.pop("policy", None)  # rl_zoo3 wants it; the first stage knows only one
+    settings = {"object_algorithm": algorithm}
+    if "n_timesteps" in algorithm:
+        settings["object_timesteps"] = algorithm.pop("n_timesteps")
+    env_kwargs = algorithm.pop("env_kwargs", {})
+    _check_names(env_kwargs, ("on_table",), f"{path}: env_kwargs of the object")
+    return settings | {f"object_{name}": value for name, value in env_kwargs.items()}
 
 
 def _override(settings: dict[str, Any], name: str, value: Any) -> None:

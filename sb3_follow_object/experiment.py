@@ -360,9 +360,8 @@ def _check_algorithms(run: FollowObject) -> None:
 def _claim(folder: Path, config: RunConfig) -> None:
     """Create the folder with its config and versions."""
     folder.mkdir(parents=True, exist_ok=True)
-    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
-    versions["python"] = platform.python_version()
-    versions["commit"] = source_commit()
+    versions: dict[str, str | None] = {n: importlib.metadata.version(n) for n in PACKAGES}
+    versions |= {"python": platform.python_version(), "commit": source_commit()}
     atomic_write(folder / "versions.json", json.dumps(versions, indent=2).encode())
     atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
 

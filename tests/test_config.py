@@ -53,7 +53,7 @@ def test_rl_zoo3_can_build_the_algorithm_from_every_entry(file: Path) -> None:
     known = {*inspect.signature(HerDDPG.__init__).parameters}
     for env_id, entry in yaml.safe_load(file.read_text()).items():
         assert env_id == "default" or env_id in IDS or env_id.startswith("Fetch")
-        own = {"n_timesteps", "n_envs", "env_wrapper", "callback"}
+        own = {"n_timesteps", "n_envs", "env_wrapper", "callback", "env_kwargs"}
         assert {"n_timesteps", "policy"} <= set(entry)
         assert set(entry) - own <= known
 
@@ -71,6 +71,7 @@ def test_paper_preset_is_the_authors_setting() -> None:
     assert (curriculum["levels"], curriculum["k_max"], curriculum["p"]) == ("time", 2, 0.2)
     assert not config.settings["store_tests"]
     assert config.settings["object_timesteps"] == 25 * 95_000
+    assert config.settings["object_on_table"] is False
     double = run_config("FollowObject/PushDoubleObstacles-v0", preset="paper")
     assert double.settings["object_timesteps"] == 50 * 152_000
 
