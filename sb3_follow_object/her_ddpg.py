@@ -6,6 +6,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import DDPG
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
@@ -62,7 +63,7 @@ class HerDDPG(DDPG):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": HerPolicy}
     _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
     policy: HerPolicy
-    replay_buffer: FollowObjectReplayBuffer | None  # type: ignore[assignment]
+    replay_buffer: FollowObjectReplayBuffer | None
 
     def __init__(
         self,
@@ -166,10 +167,11 @@ class HerDDPG(DDPG):
         n_envs: int = 1,
     ) -> tuple[np.ndarray, np.ndarray]:
         assert self._last_obs is not None
+        assert isinstance(self.action_space, spaces.Box)
         if self.num_timesteps < learning_starts:
             scaled = self.rng.uniform(-1.0, 1.0, size=(n_envs, *self.action_space.shape))
         else:
-            action, _ = self.predict(self._last_obs, deterministic=True)  # type: ignore[arg-type]
+            action, _ = self.predict(self._last_obs, deterministic=True)
             scaled = self.policy.scale_action(action)
             noise = (
                 self.rng.normal(0.0, self.noise_std, size=scaled.shape)

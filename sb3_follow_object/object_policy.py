@@ -65,7 +65,7 @@ class StopWhenSolved(BaseCallback):
         if self._rollouts % self.every_episodes:
             return
         episodes = run_episodes(
-            lambda obs: self.model.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
+            lambda obs: self.model.predict(obs, deterministic=True)[0],
             self.test_env,
             self.n_episodes,
         )

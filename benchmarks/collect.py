@@ -1,0 +1,80 @@
+"""Collect finished run folders into benchmarks/results: one row and two small files a run.
+
+    python benchmarks/collect.py runs/*
+
+A row of summary.csv is replaced by a run of the same task, method and seed. Each run's policy,
+predictor, configuration, versions and learning curve are copied beside it, so that
+`sb3-follow-object evaluate benchmarks/results/<run>` tests it again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import shutil
+from pathlib import Path
+
+RESULTS = Path(__file__).parent / "results"
+COLUMNS = (
+    "task",
+    "method",
+    "seed",
+    "env_steps",
+    "object_steps",
+    "test_steps",
+    "wall_s",
+    "success_rate",
+    "episodes",
+    "command",
+    "commit",
+)
+KEPT = ("config.json", "result.json", "versions.json", "evaluations.csv", "policy.safetensors")
+
+
+def read_row(run: Path) -> dict[str, str]:
+    """Return a finished run's row of summary.csv."""
+    result = json.loads((run / "result.json").read_text())
+    versions = json.loads((run / "versions.json").read_text())
+    result["commit"] = versions["commit"]
+    result["success_rate"] = round(result["success_rate"], 4)
+    return {column: str(result[column]) for column in COLUMNS}
+
+
+def keep_files(run: Path, row: dict[str, str]) -> None:
+    """Copy what evaluating and plotting the run again needs."""
+    target = RESULTS / f"{row['task']}-{row['method']}-{row['seed']}"
+    target.mkdir(parents=True, exist_ok=True)
+    for name in KEPT:
+        shutil.copyfile(run / name, target / name)
+    if (run / "predictor").exists():
+        shutil.copytree(run / "predictor", target / "predictor", dirs_exist_ok=True)
+
+
+def main() -> None:
+    """Collect the runs named on the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", nargs="+", type=Path, help="finished run folders")
+    runs = parser.parse_args().runs
+    RESULTS.mkdir(exist_ok=True)
+    summary = RESULTS / "summary.csv"
+    rows: dict[tuple[str, ...], dict[str, str]] = {}
+    if summary.exists():
+        with open(summary, newline="") as file:
+            rows = {(r["task"], r["method"], r["seed"]): r for r in csv.DictReader(file)}
+    for run in runs:
+        if not (run / "result.json").exists():
+            print(f"{run}: not finished, left out")
+            continue
+        row = read_row(run)
+        keep_files(run, row)
+        rows[row["task"], row["method"], row["seed"]] = row
+    with open(summary, "w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows[key] for key in sorted(rows))
+    print(f"{len(rows)} rows in {summary}")
+
+
+if __name__ == "__main__":
+    main()
