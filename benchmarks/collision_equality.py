@@ -21,6 +21,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+
 from sb3_follow_object.envs import TASKS
 from sb3_follow_object.envs.fetch import FetchSimulation
 from sb3_follow_object.envs.scene import fetch_scene

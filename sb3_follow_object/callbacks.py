@@ -17,9 +17,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from .curriculum import Curriculum
+from .envs import IDS, make_vec
 from .files import atomic_write
 from .rollout import Observation, OnStep, Policy, run_episodes
-from .wrappers import ImaginedGoalVecEnv
+from .wrappers import ImaginedGoalVecEnv, imagination_of
 
 
 class CurriculumCallback(BaseCallback):
@@ -29,8 +31,12 @@ class CurriculumCallback(BaseCallback):
     episode; rollouts of a few steps add up to one. Nothing is tested once the curriculum is
     finished. Records curriculum/k_max, curriculum/test_success and curriculum/test_steps.
 
+    The model carries the curriculum's state as ``model.curriculum_state``, which SB3 saves with it:
+    training that goes on from a loaded model, without a test_env, goes on at its k_max.
+
     Args:
-        test_env: ImaginedGoalVecEnv with mode="test", sharing the training's curriculum.
+        test_env: ImaginedGoalVecEnv with mode="test", sharing the training's curriculum; None
+            makes as many copies of the training's environment when training starts.
         n_episodes: episodes of a test, >= 1.
         every: cycles between tests, >= 1.
         store: whether to put the tests' transitions into the model's replay buffer. It is done
@@ -42,29 +48,42 @@ class CurriculumCallback(BaseCallback):
             the model's num_timesteps.
 
     Raises:
-        ValueError: an argument is outside its range, or test_env does not show h_max.
+        ValueError: an argument is outside its range, test_env does not show h_max, or training
+            starts without one in an environment that imagines no goals or cannot be copied.
     """
 
     def __init__(
         self,
-        test_env: ImaginedGoalVecEnv,
-        n_episodes: int,
+        test_env: ImaginedGoalVecEnv | None = None,
+        n_episodes: int = 16,
         every: int = 1,
         store: bool = True,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        if not isinstance(test_env, ImaginedGoalVecEnv) or test_env.mode != "test":
+        is_test = isinstance(test_env, ImaginedGoalVecEnv) and test_env.mode == "test"
+        if test_env is not None and not is_test:
             raise ValueError("test_env must be an ImaginedGoalVecEnv with mode='test'.")
         _check_positive(n_episodes=n_episodes, every=every)
-        self.test_env = test_env
-        self.curriculum = test_env.curriculum
+        self._test_env = test_env
         self.n_episodes = n_episodes
         self.every = every
         self.store = store
         self.test_steps = 0
         self._cycles = 0
         self._episode_ended = False
+
+    @property
+    def test_env(self) -> ImaginedGoalVecEnv:
+        """The environment that tests run in; one of the callback's own exists once training has."""
+        if self._test_env is None:
+            raise RuntimeError("the test environment is made when training starts")
+        return self._test_env
+
+    @property
+    def curriculum(self) -> Curriculum:
+        """The curriculum that the tests advance."""
+        return self.test_env.curriculum
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed training needs (JSON types); the curriculum has its own state."""
@@ -81,6 +100,10 @@ class CurriculumCallback(BaseCallback):
         self._episode_ended = bool(state["episode_ended"])
 
     def _on_training_start(self) -> None:
+        if self._test_env is None:
+            self._test_env = _test_copies(self.training_env)
+            if hasattr(self.model, "curriculum_state"):
+                self.curriculum.load_state_dict(self.model.curriculum_state)
         self._share_curriculum()
 
     def _on_step(self) -> bool:
@@ -118,9 +141,11 @@ class CurriculumCallback(BaseCallback):
                 )
 
     def _share_curriculum(self) -> None:
-        """Tell copies of the curriculum that live inside the training's environments."""
+        """Tell the model and the copies of the curriculum inside the training's environments."""
+        state = self.curriculum.state_dict()
+        self.model.curriculum_state = state  # type: ignore[attr-defined]
         if self.training_env.has_attr("load_curriculum"):
-            self.training_env.env_method("load_curriculum", self.curriculum.state_dict())
+            self.training_env.env_method("load_curriculum", state)
 
     def _open_buffer(self) -> Any:
         """Return the replay buffer if test episodes can go into it now, else None."""
@@ -319,6 +344,36 @@ def noise_free(model: BaseAlgorithm) -> Policy:
         return model.predict(seen, deterministic=True)[0]
 
     return policy
+
+
+def _test_copies(training_env: VecEnv) -> ImaginedGoalVecEnv:
+    """Make as many copies of the training's environment, which show h_max of its curriculum."""
+    predictor, curriculum = imagination_of(training_env, "CurriculumCallback without a test_env")
+    spec = training_env.get_attr("spec", indices=[0])[0]
+    if spec is None:
+        raise ValueError(
+            "CurriculumCallback cannot copy an environment that gymnasium.make did not make; "
+            "give it a test_env."
+        )
+    options = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
+    if spec.id in IDS:
+        options.pop("task", None)  # the id says it
+        options["reward_type"] = training_env.get_attr("reward_type", indices=[0])[0]
+    venv = make_vec(spec.id, training_env.num_envs, **options)
+    test_env = ImaginedGoalVecEnv(venv, predictor, curriculum, mode="test")
+    if _shapes(test_env) != _shapes(training_env):
+        raise ValueError(
+            f"The training's observations {_shapes(training_env)} are not those of {spec.id}, "
+            f"{_shapes(test_env)}: give CurriculumCallback a test_env with the same wrappers."
+        )
+    # NumPy's global stream is the one that SB3 seeds.
+    test_env.seed(int(np.random.randint(2**31 - 1000)))
+    return test_env
+
+
+def _shapes(env: VecEnv) -> dict[str, tuple[int, ...] | None]:
+    entries = getattr(env.observation_space, "spaces", {})
+    return {key: space.shape for key, space in entries.items()}
 
 
 def _close_episodes(buffer: HerReplayBuffer) -> None:

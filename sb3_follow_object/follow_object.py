@@ -97,7 +97,7 @@ class FollowObject:
         object_timesteps: int = 400_000,
         n_paths: int = 512,
         predictor_fit: dict[str, Any] | None = None,
-        test_every: int = 2,
+        test_every: int = 4,
         n_test_episodes: int | None = None,
         store_tests: bool = True,
         seed: int = 0,

@@ -13,25 +13,11 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from .curriculum import Curriculum
-from .goal_predictor import GoalPredictor
 from .imagination import imagine
+from .wrappers import imagination_of
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
-
-
-def _imagination_of(env: VecEnv | None) -> tuple[GoalPredictor, Curriculum]:
-    """Find the predictor and the curriculum that the environment's goals come from."""
-    try:
-        if env is not None:
-            predictor = env.get_attr("predictor", indices=[0])[0]
-            return predictor, env.get_attr("curriculum", indices=[0])[0]
-    except AttributeError:
-        pass
-    raise ValueError(
-        "imagined_ratio > 0 needs an environment wrapped in ImaginedGoalVecEnv or "
-        "ImaginedGoalWrapper; this one imagines no goals"
-    )
+IMAGINED_RATIO = "imagined_ratio > 0"  # what needs an environment that imagines goals
 
 
 class EpisodeTable:
@@ -122,6 +108,9 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         moved_ratio: share in [0, 1] of each batch drawn only from episodes in which the achieved
             goal moved by more than `moved_distance`; the rest is drawn from all. 0 is the paper's.
         moved_distance: metres.
+        min_goal_distance: metres; a hindsight goal nearer than this to where the episode's achieved
+            goal began was reached before anything was done. Such a transition keeps the goal that
+            was shown, so that episodes that moved nothing do not teach to stay. 0 is the paper's.
         reward_function: called as f(achieved (n, d), desired (n, d), infos) -> (n,); by default the
             `compute_reward` of the first environment is asked, which costs a round trip between
             processes in a SubprocVecEnv.
@@ -151,9 +140,15 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         imagined_ratio: float = 0.0,
         moved_ratio: float = 0.0,
         moved_distance: float = 0.01,
+        min_goal_distance: float = 0.0,
         reward_function: RewardFunction | None = None,
         seed: int | None = None,
     ):
+        if moved_distance < 0.0 or min_goal_distance < 0.0:
+            raise ValueError(
+                f"moved_distance ({moved_distance}) and min_goal_distance ({min_goal_distance}) "
+                "must be >= 0 metres"
+            )
         for name, ratio in (("imagined_ratio", imagined_ratio), ("moved_ratio", moved_ratio)):
             if not 0.0 <= ratio <= 1.0:
                 raise ValueError(f"{name} is {ratio}; it must lie in [0, 1]")
@@ -173,9 +168,10 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         self.imagined_ratio = imagined_ratio
         self.moved_ratio = moved_ratio
         self.moved_distance = moved_distance
+        self.min_goal_distance = min_goal_distance
         self.reward_function = reward_function
         if imagined_ratio > 0.0:
-            _imagination_of(env)  # raises the sentence now rather than at the first sample
+            imagination_of(env, IMAGINED_RATIO)  # raises now rather than at the first sample
         self.rng = np.random.default_rng(np.random.randint(2**31) if seed is None else seed)
 
         # Physics in float64 is needed while stepping, not while learning.
@@ -208,7 +204,7 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
                 self._forget_episode(int(row))
         self.ep_start[pos] = self._current_ep_start
         if self.copy_info_dict:
-            self.infos[pos] = infos  # type: ignore[assignment]
+            self.infos[pos] = infos
         if self.imagined_ratio > 0.0:
             self.original_goals[pos] = [info["original_goal"] for info in infos]
         super(HerReplayBuffer, self).add(obs, next_obs, action, reward, done, infos)
@@ -312,6 +308,10 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         virtual = np.flatnonzero(self.rng.random(batch_size) < self.her_ratio)
         if len(virtual):
             goals = self._hindsight_goals(row[virtual], step[virtual])
+            if self.min_goal_distance > 0.0:
+                far = np.linalg.norm(goals - self._origin(row[virtual]), axis=1)
+                kept = far >= self.min_goal_distance
+                virtual, goals = virtual[kept], goals[kept]
             if self.imagined_ratio > 0.0:
                 chosen = np.flatnonzero(self.rng.random(len(virtual)) < self.imagined_ratio)
                 goals[chosen] = self._imagined_goals(row[virtual[chosen]])
@@ -360,12 +360,18 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
             self.next_observations["achieved_goal"], slot * self.n_envs + self.table.env[row]
         )
 
+    def _origin(self, row: np.ndarray) -> np.ndarray:
+        """Achieved goals that the episodes began with (n, d)."""
+        flat = self.table.start[row] * self.n_envs + self.table.env[row]
+        return self._take(self.observations["achieved_goal"], flat)
+
     def _imagined_goals(self, row: np.ndarray) -> np.ndarray:
         """F_phi(o_1, g, k) of each episode at a level drawn from 1..k_max (n, d)."""
-        predictor, curriculum = _imagination_of(self.env)
-        flat = self.table.start[row] * self.n_envs + self.table.env[row]
-        start = self._take(self.observations["achieved_goal"], flat)
-        goal = self._take(self.original_goals, flat)
+        predictor, curriculum = imagination_of(self.env, IMAGINED_RATIO)
+        start = self._origin(row)
+        goal = self._take(
+            self.original_goals, self.table.start[row] * self.n_envs + self.table.env[row]
+        )
         level = self.rng.integers(1, curriculum.k_max, size=len(row), endpoint=True)
         return imagine(predictor, curriculum, start, goal, level)
 

@@ -7,7 +7,8 @@ stays in the info. So a replay buffer around a wrapper stores what the policy sa
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -17,12 +18,15 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from .curriculum import Curriculum
+from .envs import IDS, physics_id
 from .goal_predictor import POSITION, GoalPredictor
 from .imagination import draw_goals, imagine
 
 MODES = ("train", "test")
 SUCCESS_METHODS = ("is_success", "_is_success")  # ours, and gymnasium-robotics'
 STREAM = 0x60A1  # parts the goals' random numbers from those of the environment's own seed
+SHARED = ("predictor", "curriculum")  # what all copies of a vectorised environment share
+AUTO = "auto"  # the predictor that `get_predictor` keeps for the environment's task
 
 Observation = dict[str, np.ndarray]
 
@@ -35,26 +39,53 @@ class ImaginedGoalWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.n
     original goal. When an episode ends is left to the environment: one that terminates on its goal
     still does so on the original one.
 
+    A wrapper that is given a Curriculum imagines goals at once. One that is given settings shows
+    original goals until a CurriculumCallback takes it up at the start of training. So the same
+    YAML makes the environment that trains and those that evaluate or play.
+
     Args:
         env: environment with Dict goal observations, ``compute_reward`` and a success method.
-        predictor: F_phi.
-        curriculum: its k_max is read at each reset.
+        predictor: F_phi; or the folder it was saved in; or "auto", the one that ``get_predictor``
+            keeps for this task. The last two are loaded when first needed.
+        curriculum: its k_max is read at each reset; or keyword arguments of ``Curriculum`` besides
+            the horizon.
+
+    Attributes:
+        active: whether episodes that begin show imagined goals.
 
     Raises:
-        ValueError: the environment has no 3-D goals, rewards or success for any goal, or the
-            predictor and the curriculum have different horizons.
+        ValueError: the environment has no 3-D goals, rewards or success for any goal, the
+            predictor and the curriculum have different horizons, or a setting is wrong.
     """
 
-    def __init__(self, env: gym.Env, predictor: GoalPredictor, curriculum: Curriculum) -> None:
+    def __init__(
+        self,
+        env: gym.Env,
+        predictor: GoalPredictor | str | os.PathLike[str] = AUTO,
+        curriculum: Curriculum | Mapping[str, Any] | None = None,
+    ) -> None:
         super().__init__(env)
-        self._dtype = _check(env.observation_space, env.has_wrapper_attr, predictor, curriculum)
+        self._dtype = _check(env.observation_space, env.has_wrapper_attr)
         self._compute_reward = env.get_wrapper_attr("compute_reward")
         self._is_success = env.get_wrapper_attr(_success_method(env.has_wrapper_attr))
-        self.predictor = predictor
-        self.curriculum = curriculum
+        self.active = isinstance(curriculum, Curriculum)
+        self.curriculum = (
+            curriculum if isinstance(curriculum, Curriculum) else _curriculum(env, curriculum)
+        )
+        self._predictor = predictor
+        if isinstance(predictor, GoalPredictor):
+            _check_horizons(predictor, self.curriculum)
         self._rng = np.random.default_rng()
         self._shown = self._original = np.zeros(POSITION, self._dtype)
         self._level = 0
+
+    @property
+    def predictor(self) -> GoalPredictor:
+        """F_phi, loaded (or, with "auto", learned) when it is first asked for."""
+        if not isinstance(self._predictor, GoalPredictor):
+            self._predictor = _find_predictor(self._predictor, self.env)
+            _check_horizons(self._predictor, self.curriculum)
+        return self._predictor
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -63,16 +94,17 @@ class ImaginedGoalWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.n
         if seed is not None:
             self._rng = np.random.default_rng([seed, STREAM])
         obs, info = self.env.reset(seed=seed, options=options)
-        shown, level = draw_goals(
-            self.predictor,
-            self.curriculum,
-            obs["achieved_goal"][None],
-            obs["desired_goal"][None],
-            self._rng,
-        )
-        self._shown = shown[0].astype(self._dtype)
         self._original = obs["desired_goal"].copy()
-        self._level = int(level[0])
+        self._shown, self._level = self._original, 0
+        if self.active:
+            shown, level = draw_goals(
+                self.predictor,
+                self.curriculum,
+                obs["achieved_goal"][None],
+                obs["desired_goal"][None],
+                self._rng,
+            )
+            self._shown, self._level = shown[0].astype(self._dtype), int(level[0])
         return self._relabel(obs), {**info, **self._facts()}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -90,8 +122,9 @@ class ImaginedGoalWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.n
         return self._relabel(obs), float(reward), terminated, truncated, info
 
     def load_curriculum(self, state: dict[str, Any]) -> None:
-        """Follow a curriculum that advances in another process (``Curriculum.state_dict``)."""
+        """Follow a curriculum that advances elsewhere (``Curriculum.state_dict``), from now on."""
         self.curriculum.load_state_dict(state)
+        self.active = True
 
     def _relabel(self, obs: Observation) -> Observation:
         return {**obs, "desired_goal": self._shown.copy()}
@@ -129,7 +162,8 @@ class ImaginedGoalVecEnv(VecEnvWrapper):
         if mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {mode!r}.")
         super().__init__(venv)
-        self._dtype = _check(venv.observation_space, venv.has_attr, predictor, curriculum)
+        self._dtype = _check(venv.observation_space, venv.has_attr)
+        _check_horizons(predictor, curriculum)
         self._success_method = _success_method(venv.has_attr)
         self.predictor = predictor
         self.curriculum = curriculum
@@ -194,9 +228,13 @@ class ImaginedGoalVecEnv(VecEnvWrapper):
             self._draw(ended, obs)
         return self._relabel(obs), rewards, dones, infos
 
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether ``get_attr`` has an answer."""
+        return attr_name in SHARED or super().has_attr(attr_name)
+
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the copies; predictor and curriculum are the same for all."""
-        if attr_name in ("predictor", "curriculum"):
+        if attr_name in SHARED:
             return [getattr(self, attr_name) for _ in self._get_indices(indices)]
         return super().get_attr(attr_name, indices)
 
@@ -257,12 +295,59 @@ class ImaginedGoalVecEnv(VecEnvWrapper):
         return {"original_goal": self._original[i].copy(), "imagined_level": int(self._level[i])}
 
 
-def _check(
-    space: spaces.Space,
-    has: Callable[[str], bool],
-    predictor: GoalPredictor,
-    curriculum: Curriculum,
-) -> np.dtype[Any]:
+def imagination_of(env: VecEnv | None, asker: str) -> tuple[GoalPredictor, Curriculum]:
+    """Return the predictor and the curriculum that an environment's goals come from.
+
+    Raises:
+        ValueError: the environment imagines no goals; the message begins with ``asker``.
+    """
+    if env is None or not env.has_attr("curriculum"):
+        raise ValueError(
+            f"{asker} needs an environment wrapped in ImaginedGoalVecEnv or ImaginedGoalWrapper; "
+            "this one imagines no goals"
+        )
+    predictor = env.get_attr("predictor", indices=[0])[0]
+    return predictor, env.get_attr("curriculum", indices=[0])[0]
+
+
+def _find_predictor(source: str | os.PathLike[str], env: gym.Env) -> GoalPredictor:
+    """Return the F_phi that "auto" or a folder means for an environment's task."""
+    if env.spec is None:
+        raise ValueError(
+            f"predictor={str(source)!r} needs an environment made by gymnasium.make, "
+            "whose id says which task it is; give a GoalPredictor."
+        )
+    if source == AUTO:
+        # Late: learning one needs the classes that need this module.
+        from .predictors import get_predictor
+
+        return get_predictor(env.spec.id)
+    physics = physics_id(env.spec.id) if env.spec.id in IDS else None
+    return GoalPredictor.load(source, env_id=env.spec.id, physics=physics)
+
+
+def _curriculum(env: gym.Env, settings: Mapping[str, Any] | None) -> Curriculum:
+    """Return a curriculum of the environment's horizon."""
+    if env.spec is None or env.spec.max_episode_steps is None:
+        raise ValueError(
+            "The environment does not say how long its episodes are (spec.max_episode_steps); "
+            "give a Curriculum."
+        )
+    try:
+        return Curriculum(env.spec.max_episode_steps, **(settings or {}))
+    except TypeError as error:
+        raise ValueError(f"The curriculum cannot have these settings: {error}.") from error
+
+
+def _check_horizons(predictor: GoalPredictor, curriculum: Curriculum) -> None:
+    if predictor.horizon != curriculum.horizon:
+        raise ValueError(
+            f"The predictor imagines {predictor.horizon} steps, "
+            f"but the curriculum has horizon {curriculum.horizon}."
+        )
+
+
+def _check(space: spaces.Space, has: Callable[[str], bool]) -> np.dtype[Any]:
     """Refuse what cannot be wrapped; return the dtype of goals."""
     keys = set(space.spaces) if isinstance(space, spaces.Dict) else set()
     missing = {"observation", "achieved_goal", "desired_goal"} - keys
@@ -281,11 +366,6 @@ def _check(
         raise ValueError(
             "Imagined goals need an environment with compute_reward(achieved, desired, info), "
             "this one has none."
-        )
-    if predictor.horizon != curriculum.horizon:
-        raise ValueError(
-            f"The predictor imagines {predictor.horizon} steps, "
-            f"but the curriculum has horizon {curriculum.horizon}."
         )
     return goals.dtype
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sb3_follow_object.envs import physics_id
 
 from sb3_follow_object import extras
 from sb3_follow_object.cli import main
+from sb3_follow_object.envs import physics_id
 from sb3_follow_object.goal_predictor import GoalPredictor
 from sb3_follow_object.predictors import CACHE_VARIABLE, get_predictor
 from sb3_follow_object.progress import ProgressBar

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import yaml
-from sb3_follow_object.envs import IDS
 
 from sb3_follow_object.config import (
     CALLBACK,
@@ -22,6 +21,7 @@ from sb3_follow_object.config import (
     preset_file,
     run_config,
 )
+from sb3_follow_object.envs import IDS
 from sb3_follow_object.her_ddpg import HerDDPG
 
 TASK = "FollowObject/PushSideGap-v0"

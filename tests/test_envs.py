@@ -6,6 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import sb3_follow_object  # noqa: F401  registers the ids
 from sb3_follow_object.envs import (
     IDS,
     TASKS,
@@ -18,9 +21,6 @@ from sb3_follow_object.envs import (
 )
 from sb3_follow_object.envs.scene import fetch_scene
 from sb3_follow_object.envs.tasks import MIN_START_DISTANCE, reference_point
-from stable_baselines3.common.env_checker import check_env as check_env_sb3
-
-import sb3_follow_object  # noqa: F401  registers the ids
 
 every_id = pytest.mark.parametrize("env_id", IDS)
 

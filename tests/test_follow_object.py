@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from sb3_follow_object.envs import make_vec, physics_id
 
+from sb3_follow_object.envs import make_vec, physics_id
 from sb3_follow_object.experiment import RunConfig, evaluate, train
 from sb3_follow_object.follow_object import FollowObject, stream_seed
 from sb3_follow_object.goal_predictor import GoalPredictor

@@ -131,6 +131,26 @@ def test_moved_ratio_draws_episodes_in_which_the_object_moved() -> None:
         assert buffer.table.moved[row].mean() == pytest.approx(expected, abs=0.02)
 
 
+def test_hindsight_goals_lie_away_from_where_the_episode_began() -> None:
+    """Nearer ones leave the transition as it was shown, reward included."""
+    env = make_env(env_class=LazyPointEnv)
+    buffer = make_buffer(env, min_goal_distance=0.05, n_sampled_goal=10**9)
+    fill([buffer], env, 20 * HORIZON)
+    seen = buffer.observations["observation"][: 20 * HORIZON]
+    shown = buffer.observations["desired_goal"].reshape(-1, 3)
+    got = as_arrays(buffer.sample(4000))
+    is_shown = (got["goal"][:, None] == shown[None]).all(axis=2).any(axis=1)
+    assert 0.5 < is_shown.mean() < 0.9  # all of the lazy episodes, early steps of the others
+    moved = {key: value[~is_shown] for key, value in got.items()}
+    same = (moved["obs"][:, None, None] == seen[None]).all(axis=3)
+    _, slot, env_idx = np.nonzero(same)
+    starts = seen[slot // HORIZON * HORIZON, env_idx]
+    assert len(starts) == len(moved["goal"])
+    assert np.linalg.norm(moved["goal"] - starts, axis=1).min() > 0.0499
+    expected = PointEnv().compute_reward(got["next_achieved"], got["goal"], {})
+    np.testing.assert_array_equal(got["reward"], expected)
+
+
 def test_imagined_ratio_relabels_with_imagined_goals() -> None:
     curriculum = Curriculum(HORIZON, k_max=3, p=0.5)
     env = ImaginedGoalVecEnv(make_env(), StraightPredictor(), curriculum)
@@ -150,6 +170,8 @@ def test_imagined_ratio_needs_the_wrapper() -> None:
         make_buffer(make_env(), imagined_ratio=0.1)
     with pytest.raises(ValueError, match="must lie in"):
         make_buffer(make_env(), moved_ratio=1.5)
+    with pytest.raises(ValueError, match="must be >= 0 metres"):
+        make_buffer(make_env(), min_goal_distance=-0.05)
 
 
 @pytest.mark.parametrize("way", ["pickle", "state_dict"])

@@ -8,6 +8,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+
 from sb3_follow_object.envs import TASKS, FetchEnv, ObjectEnv, Region, Task, object_only
 from sb3_follow_object.envs.scene import fetch_scene, fetch_spec
 
