@@ -29,8 +29,8 @@ test-mujoco-range: $(INSTALLED)
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	rm -rf build/mypy && mkdir -p build/mypy/sb3_follow_object
-	ln -s $(wildcard $(CURDIR)/sb3_follow_object/*) $(CURDIR)/envs $(CURDIR)/zoo_configs \
+	@rm -rf build/mypy && mkdir -p build/mypy/sb3_follow_object
+	@ln -s $(wildcard $(CURDIR)/sb3_follow_object/*) $(CURDIR)/envs $(CURDIR)/zoo_configs \
 		build/mypy/sb3_follow_object/
 	MYPYPATH=build/mypy $(BIN)/mypy -p sb3_follow_object
 
