@@ -45,7 +45,7 @@ _NOT_SETTINGS |= {"observation_space", "action_space", "lr_schedule", "reward_fu
 _NOT_SETTINGS |= {"paths", "goals", "physics", "progress"}
 
 _AT_LEAST_ONE = {"n_timesteps", "batch_size", "buffer_size", "gradient_steps", "n_paths"}
-_AT_LEAST_ONE |= {"object_timesteps", "test_every", "n_test_episodes", "n_threads"}
+_AT_LEAST_ONE |= {"object_timesteps", "object_n_envs", "test_every", "n_test_episodes", "n_threads"}
 
 
 def preset_file(method: str, preset: str = "default") -> Path:
@@ -266,9 +266,10 @@ def _object_stage(entry: dict[str, Any], path: Path) -> dict[str, Any]:
     """Return the first stage's settings from the entry of the object's own environment."""
     algorithm = _plain(entry)
     algorithm.pop("policy", None)  # rl_zoo3 wants it; the first stage knows only one
-    settings = {"object_algorithm": algorithm}
-    if "n_timesteps" in algorithm:
-        settings["object_timesteps"] = algorithm.pop("n_timesteps")
+    settings: dict[str, Any] = {"object_algorithm": algorithm}
+    for name, ours in (("n_timesteps", "object_timesteps"), ("n_envs", "object_n_envs")):
+        if name in algorithm:
+            settings[ours] = algorithm.pop(name)
     env_kwargs = algorithm.pop("env_kwargs", {})
     _check_names(env_kwargs, ("on_table",), f"{path}: env_kwargs of the object")
     return settings | {f"object_{name}": value for name, value in env_kwargs.items()}

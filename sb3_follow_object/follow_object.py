@@ -26,9 +26,6 @@ from .object_policy import collect_paths, train_object_policy
 from .policies import save_actor
 from .wrappers import ImaginedGoalVecEnv
 
-# Copies of the object's environment; it is cheap, and the robot's number need not suit it.
-_OBJECT_COPIES = 16
-
 Report = Callable[[str], None]
 
 
@@ -63,6 +60,7 @@ class FollowObject:
         object_on_table: whether the object may not leave the table in the first stage; by default
             where the gripper is blocked (Push tasks), so that the imagined goals can be reached by
             pushing. The paper's object may always leave it.
+        object_n_envs: parallel copies of the object's environment, >= 1.
         object_timesteps: env steps after which the object stage gives up.
         n_paths: noise-free object paths that F_phi is fitted on.
         predictor_fit: keyword arguments of `GoalPredictor.fit`.
@@ -94,6 +92,7 @@ class FollowObject:
         curriculum: dict[str, Any] | None = None,
         object_algorithm: dict[str, Any] | None = None,
         object_on_table: bool | None = None,
+        object_n_envs: int = 16,
         object_timesteps: int = 400_000,
         n_paths: int = 512,
         predictor_fit: dict[str, Any] | None = None,
@@ -113,6 +112,7 @@ class FollowObject:
             "curriculum": dict(curriculum or {}),
             "object_algorithm": dict(object_algorithm or {}),
             "object_on_table": object_on_table,
+            "object_n_envs": object_n_envs,
             "object_timesteps": object_timesteps,
             "n_paths": n_paths,
             "predictor_fit": dict(predictor_fit or {}),
@@ -368,7 +368,10 @@ class FollowObject:
         if on_table is None:
             on_table = IDS[self.env_id][0].blocked_gripper
         env = make_vec(
-            object_id(self.env_id), _OBJECT_COPIES, self.settings["n_threads"], on_table=on_table
+            object_id(self.env_id),
+            self.settings["object_n_envs"],
+            self.settings["n_threads"],
+            on_table=on_table,
         )
         env.seed(stream_seed(self.seed, purpose))
         return env

@@ -71,6 +71,7 @@ def test_paper_preset_is_the_authors_setting() -> None:
     assert (curriculum["levels"], curriculum["k_max"], curriculum["p"]) == ("time", 2, 0.2)
     assert not config.settings["store_tests"]
     assert config.settings["object_timesteps"] == 25 * 95_000
+    assert config.settings["object_n_envs"] == 38
     assert config.settings["object_on_table"] is False
     double = run_config("FollowObject/PushDoubleObstacles-v0", preset="paper")
     assert double.settings["object_timesteps"] == 50 * 152_000
