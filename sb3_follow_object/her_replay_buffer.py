@@ -17,6 +17,7 @@ from .imagination import imagine
 from .wrappers import imagination_of
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
+GRAVITY = 9.81  # m/s^2
 IMAGINED_RATIO = "imagined_ratio > 0"  # what needs an environment that imagines goals
 
 
@@ -27,17 +28,17 @@ class EpisodeTable:
     episodes only through a binary search.
     """
 
-    _ARRAYS = ("start", "env", "length", "moved")
+    _ARRAYS = ("start", "env", "length", "priority")
 
     def __init__(self) -> None:
         self.start = np.zeros(64, dtype=np.int64)
         self.env = np.zeros(64, dtype=np.int64)
         self.length = np.zeros(64, dtype=np.int64)
-        self.moved = np.zeros(64, dtype=bool)
+        self.priority = np.zeros(64)  # 0: drawn with all episodes only
         self._free = list(range(63, -1, -1))
         self._draw_lists: dict[bool, tuple[np.ndarray, np.ndarray]] = {}
 
-    def insert(self, start: int, env: int, length: int, moved: bool) -> int:
+    def insert(self, start: int, env: int, length: int, priority: float) -> int:
         """Add an episode and return its row."""
         if not self._free:
             n = len(self.length)
@@ -47,7 +48,7 @@ class EpisodeTable:
             self._free = list(range(2 * n - 1, n - 1, -1))
         row = self._free.pop()
         self.start[row], self.env[row] = start, env
-        self.length[row], self.moved[row] = length, moved
+        self.length[row], self.priority[row] = length, priority
         self._draw_lists.clear()
         return row
 
@@ -68,28 +69,29 @@ class EpisodeTable:
         self._free = list(state["free"])
         self._draw_lists.clear()
 
-    def _draw_list(self, moved_only: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Rows to draw from and the running sum of their lengths."""
-        if moved_only not in self._draw_lists:
-            alive = self.length > 0
-            rows = np.flatnonzero(alive & self.moved if moved_only else alive)
-            self._draw_lists[moved_only] = rows, np.cumsum(self.length[rows])
-        return self._draw_lists[moved_only]
+    def _draw_list(self, by_priority: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Rows to draw from and the running sum of their weights."""
+        if by_priority not in self._draw_lists:
+            weight = self.length * self.priority if by_priority else self.length
+            rows = np.flatnonzero(weight > 0)
+            self._draw_lists[by_priority] = rows, np.cumsum(weight[rows])
+        return self._draw_lists[by_priority]
 
-    def n_transitions(self, moved_only: bool = False) -> int:
-        """Transitions in finished episodes."""
-        _, ends = self._draw_list(moved_only)
-        return int(ends[-1]) if len(ends) else 0
+    def n_transitions(self, with_priority: bool = False) -> int:
+        """Transitions in finished episodes, or in those with a priority."""
+        return int(self.length[self._draw_list(with_priority)[0]].sum())
 
     def draw(
-        self, n: int, rng: np.random.Generator, moved_only: bool = False
+        self, n: int, rng: np.random.Generator, by_priority: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw n transitions uniformly: rows of the table (n,) and steps within them (n,)."""
-        rows, ends = self._draw_list(moved_only)
-        u = rng.integers(ends[-1], size=n)
-        which = np.searchsorted(ends, u, side="right")
-        row = rows[which]
-        return row, u - (ends[which] - self.length[row])
+        """Draw n transitions: rows of the table (n,) and steps within them (n,).
+
+        Uniformly over transitions, or episodes in proportion to length times priority.
+        """
+        rows, ends = self._draw_list(by_priority)
+        which = np.searchsorted(ends, rng.random(n) * ends[-1], side="right")
+        row = rows[np.minimum(which, len(rows) - 1)]
+        return row, rng.integers(self.length[row])
 
 
 class FollowObjectReplayBuffer(HerReplayBuffer):
@@ -108,6 +110,11 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         moved_ratio: share in [0, 1] of each batch drawn only from episodes in which the achieved
             goal moved by more than `moved_distance`; the rest is drawn from all. 0 is the paper's.
         moved_distance: metres.
+        moved_priority: how that share is drawn: "uniform", or "energy", in proportion to the
+            energy that the object was given in the episode (Zhao and Tresp, Energy-Based Hindsight
+            Experience Prioritization), so that lifting counts for more than pushing. The third
+            coordinate of a goal is then its height.
+        step_seconds: duration of an environment step, for the object's speed.
         min_goal_distance: metres; a hindsight goal nearer than this to where the episode's achieved
             goal began was reached before anything was done. Such a transition keeps the goal that
             was shown, so that episodes that moved nothing do not teach to stay. 0 is the paper's.
@@ -140,10 +147,16 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         imagined_ratio: float = 0.0,
         moved_ratio: float = 0.0,
         moved_distance: float = 0.01,
+        moved_priority: str = "uniform",
+        step_seconds: float = 0.04,
         min_goal_distance: float = 0.0,
         reward_function: RewardFunction | None = None,
         seed: int | None = None,
     ):
+        if moved_priority not in ("uniform", "energy"):
+            raise ValueError(f"moved_priority is {moved_priority!r}; 'uniform' and 'energy' exist")
+        if step_seconds <= 0.0:
+            raise ValueError(f"step_seconds is {step_seconds}; it must be > 0")
         if moved_distance < 0.0 or min_goal_distance < 0.0:
             raise ValueError(
                 f"moved_distance ({moved_distance}) and min_goal_distance ({min_goal_distance}) "
@@ -168,6 +181,8 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         self.imagined_ratio = imagined_ratio
         self.moved_ratio = moved_ratio
         self.moved_distance = moved_distance
+        self.moved_priority = moved_priority
+        self.step_seconds = step_seconds
         self.min_goal_distance = min_goal_distance
         self.reward_function = reward_function
         if imagined_ratio > 0.0:
@@ -226,10 +241,22 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         length = (self.pos - start) % self.buffer_size or self.buffer_size
         slots = (start + np.arange(length)) % self.buffer_size
         self.ep_length[slots, env_idx] = length
-        path = self.next_observations["achieved_goal"][slots, env_idx]
         origin = self.observations["achieved_goal"][start, env_idx]
-        moved = np.linalg.norm(path - origin, axis=-1).max() > self.moved_distance
-        self._row_of_slot[slots, env_idx] = self.table.insert(start, env_idx, length, bool(moved))
+        path = self.next_observations["achieved_goal"][slots, env_idx]
+        row = self.table.insert(start, env_idx, length, self._priority(origin, path))
+        self._row_of_slot[slots, env_idx] = row
+
+    def _priority(self, origin: np.ndarray, path: np.ndarray) -> float:
+        """Priority of an episode from where the achieved goal began (d,) and went (length, d)."""
+        if np.linalg.norm(path - origin, axis=-1).max() <= self.moved_distance:
+            return 0.0
+        if self.moved_priority == "uniform":
+            return 1.0
+        moves = np.diff(path, axis=0, prepend=origin[None])
+        speed = np.linalg.norm(moves, axis=-1) / self.step_seconds
+        energy = GRAVITY * path[:, 2] + 0.5 * speed**2  # a unit mass's
+        gains = np.diff(energy, prepend=GRAVITY * origin[2])
+        return float(np.clip(gains, 0.0, None).sum())
 
     def state_dict(self) -> dict[str, Any]:
         """Return the content and the generator, as views that later additions change."""
@@ -276,7 +303,7 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
     def moved_share(self) -> float:
         """Share of the stored transitions that belong to episodes in which the object moved."""
         total = self.table.n_transitions()
-        return self.table.n_transitions(moved_only=True) / total if total else 0.0
+        return self.table.n_transitions(with_priority=True) / total if total else 0.0
 
     def sample(  # type: ignore[override]
         self, batch_size: int, env: VecNormalize | None = None
@@ -334,9 +361,9 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
 
     def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         row, step = self.table.draw(n, self.rng)
-        if self.moved_ratio > 0.0 and self.table.n_transitions(moved_only=True):
+        if self.moved_ratio > 0.0 and self.table.n_transitions(with_priority=True):
             chosen = np.flatnonzero(self.rng.random(n) < self.moved_ratio)
-            row[chosen], step[chosen] = self.table.draw(len(chosen), self.rng, moved_only=True)
+            row[chosen], step[chosen] = self.table.draw(len(chosen), self.rng, by_priority=True)
         return row, step
 
     def _take(self, store: np.ndarray, flat: np.ndarray) -> np.ndarray:

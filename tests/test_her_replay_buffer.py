@@ -128,7 +128,23 @@ def test_moved_ratio_draws_episodes_in_which_the_object_moved() -> None:
         fill([buffer], env, 20 * HORIZON)
         assert buffer.moved_share() == 0.5
         row, _ = buffer._draw(20_000)
-        assert buffer.table.moved[row].mean() == pytest.approx(expected, abs=0.02)
+        assert (buffer.table.priority[row] > 0).mean() == pytest.approx(expected, abs=0.02)
+
+
+def test_energy_priority_prefers_lifts_to_pushes() -> None:
+    buffer = make_buffer(make_env(), moved_ratio=1.0, moved_priority="energy")
+    origin = np.zeros(3)
+    along = np.linspace(0.005, 0.2, 40)[:, None]
+    push, lift = along * np.array([1.0, 0, 0]), along * np.array([0, 0, 1.0])
+    assert buffer._priority(origin, 0.01 * push) == 0.0
+    # Speed 0.125 m/s is 0.0078 J/kg; 0.2 m of height is 1.962 J/kg.
+    assert buffer._priority(origin, push) == pytest.approx(0.0078, abs=2e-4)
+    assert buffer._priority(origin, lift) == pytest.approx(1.962 + 0.0078, abs=2e-3)
+    buffer.table.insert(0, 0, 10, 1.0)
+    buffer.table.insert(10, 0, 10, 3.0)
+    row, step = buffer.table.draw(20_000, np.random.default_rng(0), by_priority=True)
+    assert (row == 1).mean() == pytest.approx(0.75, abs=0.02)
+    assert set(step) == set(range(10))
 
 
 def test_hindsight_goals_lie_away_from_where_the_episode_began() -> None:
@@ -170,6 +186,8 @@ def test_imagined_ratio_needs_the_wrapper() -> None:
         make_buffer(make_env(), imagined_ratio=0.1)
     with pytest.raises(ValueError, match="must lie in"):
         make_buffer(make_env(), moved_ratio=1.5)
+    with pytest.raises(ValueError, match="moved_priority is 'speed'"):
+        make_buffer(make_env(), moved_priority="speed")
     with pytest.raises(ValueError, match="must be >= 0 metres"):
         make_buffer(make_env(), min_goal_distance=-0.05)
 
