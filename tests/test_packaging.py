@@ -80,3 +80,7 @@ def test_every_public_name_exists(name: str) -> None:
 def test_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="Curiculum"):
         sb3_follow_object.Curiculum  # noqa: B018
+
+
+def test_command_is_installed(python: Path, tmp_path: Path) -> None:
+    assert "train" in run([str(python.parent / "sb3-follow-object"), "--help"], cwd=tmp_path)
