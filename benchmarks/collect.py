@@ -4,7 +4,8 @@
 
 A row of summary.csv is replaced by a run of the same task, method and seed. Each run's policy,
 predictor, configuration, versions and learning curve are copied beside it, so that
-`sb3-follow-object evaluate benchmarks/results/<run>` tests it again.
+`sb3-follow-object evaluate benchmarks/results/<run>` tests it again. README's table is drawn from
+summary.csv: medians over seeds.
 """
 
 from __future__ import annotations
@@ -13,9 +14,13 @@ import argparse
 import csv
 import json
 import shutil
+from itertools import groupby
 from pathlib import Path
+from statistics import median
 
 RESULTS = Path(__file__).parent / "results"
+README = Path(__file__).parents[1] / "README.md"
+BEGIN, END = "<!-- results: python benchmarks/collect.py -->\n", "<!-- end of results -->"
 COLUMNS = (
     "task",
     "method",
@@ -51,10 +56,28 @@ def keep_files(run: Path, row: dict[str, str]) -> None:
         shutil.copytree(run / "predictor", target / "predictor", dirs_exist_ok=True)
 
 
+def table(rows: list[dict[str, str]]) -> str:
+    """Return the results as a Markdown table, a line for each task and method."""
+    lines = [
+        "| task | method | seeds | env steps | minutes | success |",
+        "|---|---|---|---|---|---|",
+    ]
+    for (task, method), group in groupby(rows, key=lambda row: (row["task"], row["method"])):
+        runs = list(group)
+        seeds = ", ".join(row["seed"] for row in runs)
+        steps, seconds, rate = (
+            median(float(row[name]) for row in runs)
+            for name in ("env_steps", "wall_s", "success_rate")
+        )
+        cells = (task, method.upper(), seeds, f"{steps:,.0f}", f"{seconds / 60:.0f}", f"{rate:.2f}")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
     """Collect the runs named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("runs", nargs="+", type=Path, help="finished run folders")
+    parser.add_argument("runs", nargs="*", type=Path, help="finished run folders")
     runs = parser.parse_args().runs
     RESULTS.mkdir(exist_ok=True)
     summary = RESULTS / "summary.csv"
@@ -72,7 +95,10 @@ def main() -> None:
     with open(summary, "w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows[key] for key in sorted(rows))
+        writer.writerows(ordered := [rows[key] for key in sorted(rows)])
+    text = README.read_text()
+    head, rest = text.split(BEGIN)
+    README.write_text(head + BEGIN + table(ordered) + END + rest.split(END)[1])
     print(f"{len(rows)} rows in {summary}")
 
 

@@ -91,6 +91,7 @@ def draw_curves(folders: Sequence[str | os.PathLike[str]], out: str | os.PathLik
         ValueError: a folder holds nothing to plot.
     """
     figure_module = need("matplotlib.figure", "plots")
+    ticker = need("matplotlib.ticker", "plots")
     groups: dict[tuple[str, str], list[Curve]] = {}
     for curve in map(read_curve, folders):
         groups.setdefault((curve.task, curve.method), []).append(curve)
@@ -106,6 +107,7 @@ def draw_curves(folders: Sequence[str | os.PathLike[str]], out: str | os.PathLik
         _draw_group(axes, shown, group, label)
     for row, y in zip(axes, shown, strict=True):
         for axis, (name, _) in zip(row, _X.values(), strict=True):
+            axis.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
             axis.set(xlabel=name, ylabel=_Y[y], xlim=(0, None), ylim=(0, None))
             if y == "success_rate":
                 axis.set_ylim(-0.02, 1.02)
