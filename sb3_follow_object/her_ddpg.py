@@ -97,6 +97,8 @@ class HerDDPG(DDPG):
             raise ValueError(f"random_action_prob is {random_action_prob}; it must lie in [0, 1]")
         if noise_std < 0.0 or action_l2 < 0.0:
             raise ValueError(f"noise_std ({noise_std}) and action_l2 ({action_l2}) must be >= 0")
+        if isinstance(target_clip, str) and target_clip != "auto":
+            raise ValueError(f'target_clip is {target_clip!r}; give (low, high), "auto" or None')
         if target_update_interval < 1:
             raise ValueError(f"target_update_interval is {target_update_interval}; must be >= 1")
         super().__init__(
