@@ -1,7 +1,7 @@
 """The tasks of the paper as environments: the robot's and the object's alone, single and batched.
 
-Importing this loads little: gymnasium's plug-in may do so while
-Stable-Baselines3 is itself being imported, so the classes are loaded when first used.
+Importing this registers ids and loads little: the classes, and with them mujoco and
+Stable-Baselines3, are loaded when first used.
 """
 
 from importlib import import_module
