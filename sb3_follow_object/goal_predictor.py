@@ -69,7 +69,8 @@ class GoalPredictor:
             {name: value for name, value in tensors.items() if name not in _scales()}
         )
         self._network.eval()
-        self._scales = {name: tensors[name].numpy() for name in _scales()}
+        # Copies: torch moves a tensor's memory when it is sent to another process.
+        self._scales = {name: tensors[name].numpy().copy() for name in _scales()}
 
     @classmethod
     def fit(
