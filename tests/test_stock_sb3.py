@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -170,7 +171,11 @@ def test_a_loaded_model_trains_on_at_its_k_max(tmp_path: Path) -> None:
     assert callback.curriculum.k_max == 4
 
 
-@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
+# Spawned processes see the cache folder of this module; a server that forks them may be older.
+SPAWNED = partial(SubprocVecEnv, start_method="spawn")
+
+
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, SPAWNED], ids=["Dummy", "Subproc"])
 def test_copies_made_from_settings_follow_one_curriculum(vec_env: Any) -> None:
     env: VecEnv = vec_env([lambda: wrapped(reward_type="dense")] * 2)
     try:
