@@ -143,7 +143,8 @@ class HerDDPG(DDPG):
             self.gamma = 1.0 - 1.0 / self._horizon()
         super()._setup_model()
         self.rng = np.random.default_rng(np.random.randint(2**31))
-        self.moments = RunningMeanStd(shape=(self.actor.features_dim,))
+        if not hasattr(self, "moments"):  # SB3's load() brings them before it comes here
+            self.moments = RunningMeanStd(shape=(self.actor.features_dim,))
         self._moments_pos = 0
         if isinstance(self.train_freq, TrainFreq) and (
             self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1

@@ -154,6 +154,8 @@ def test_sb3_saves_and_loads_it(tmp_path: Any) -> None:
     model.learn(400, log_interval=None)  # type: ignore[arg-type]
     model.save(tmp_path / "model")
     loaded = HerDDPG.load(tmp_path / "model", env=model.env)
+    np.testing.assert_array_equal(loaded.moments.mean, model.moments.mean)
+    assert loaded.moments.count == model.moments.count
     obs = model.env.reset()  # type: ignore[union-attr]
     np.testing.assert_array_equal(
         model.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
