@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -13,6 +15,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import (
+    DictReplayBufferSamples,
     GymEnv,
     Schedule,
     TrainFreq,
@@ -29,6 +32,7 @@ SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 _SAMPLE_CHUNK = 32_768
 # Floor of the standard deviations, so that entries that hardly vary are not blown up.
 _MIN_STD = 0.01
+_PRECISIONS = ("highest", "high", "medium")
 
 
 class HerDDPG(DDPG):
@@ -38,6 +42,7 @@ class HerDDPG(DDPG):
 
     - inputs are standardised by running moments of everything stored, clipped to +-5;
     - the critic's targets are clipped to [-1/(1 - gamma), 0], where returns of a -1/0 reward lie;
+    - with `hindsight_bound` a target is at least what the stored episode proves to be possible;
     - the actor's loss has `action_l2` times the mean squared action added;
     - with probability `random_action_prob` an action is uniform, else Gaussian noise is added;
     - episodes may be collected from several environments at once: `train_freq=(n, "episode")`;
@@ -51,7 +56,15 @@ class HerDDPG(DDPG):
         random_action_prob: in [0, 1].
         action_l2: weight, >= 0.
         target_clip: (low, high) bounds of the targets; "auto" is [-1/(1 - gamma), 0]; None, none.
+        hindsight_bound: raise the target of a transition, whose episode was on the hindsight goal j
+            steps later, to -(1 - gamma^j)/(1 - gamma): the return of doing the same and staying
+            there. Distances are then read off the episodes instead of spreading step by step
+            through the targets. Beyond the paper; for rewards of -1 and 0, objects that can be
+            made to stay, and a `FollowObjectReplayBuffer`.
         target_update_interval: in gradient updates, >= 1. The authors: once a cycle of 40.
+        matmul_precision: of the float32 matrix products of an update, as in
+            `torch.set_float32_matmul_precision`: "medium" lets processors with bfloat16 units
+            multiply in bfloat16 and add up in float32, which is faster; others ignore it.
         policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.
 
     The other arguments are DDPG's.
@@ -85,7 +98,9 @@ class HerDDPG(DDPG):
         random_action_prob: float = 0.3,
         action_l2: float = 1.0,
         target_clip: tuple[float, float] | str | None = "auto",
+        hindsight_bound: bool = False,
         target_update_interval: int = 1,
+        matmul_precision: str = "highest",
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
@@ -101,6 +116,10 @@ class HerDDPG(DDPG):
             raise ValueError(f'target_clip is {target_clip!r}; give (low, high), "auto" or None')
         if target_update_interval < 1:
             raise ValueError(f"target_update_interval is {target_update_interval}; must be >= 1")
+        if matmul_precision not in _PRECISIONS:
+            raise ValueError(
+                f"matmul_precision is {matmul_precision!r}; {', '.join(_PRECISIONS)} exist"
+            )
         super().__init__(
             policy,
             env,
@@ -127,7 +146,9 @@ class HerDDPG(DDPG):
         self.random_action_prob = random_action_prob
         self.action_l2 = action_l2
         self.target_clip = target_clip
+        self.hindsight_bound = hindsight_bound
         self.target_update_interval = target_update_interval
+        self.matmul_precision = matmul_precision
         if _init_setup_model:
             self._setup_model()
 
@@ -255,6 +276,10 @@ class HerDDPG(DDPG):
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Take gradient steps; several batches are drawn from the buffer in one call."""
+        with _matmul_precision(self.matmul_precision):
+            self._train(gradient_steps, batch_size)
+
+    def _train(self, gradient_steps: int, batch_size: int) -> None:
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
@@ -270,20 +295,29 @@ class HerDDPG(DDPG):
         while steps_left > 0:
             n = min(steps_left, max(1, _SAMPLE_CHUNK // batch_size))
             steps_left -= n
-            data = self.replay_buffer.sample(n * batch_size, env=self._vec_normalize_env)
+            data, steps_to_goal = self._sample(n * batch_size)
+            bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
             # All four networks share their input moments, so features are computed once.
             features = self.actor.features_extractor(data.observations).split(batch_size)
             next_features = self.actor.features_extractor(data.next_observations).split(batch_size)
             actions = data.actions.split(batch_size)
             rewards, dones = data.rewards.split(batch_size), data.dones.split(batch_size)
-            for x, next_x, a, r, d in zip(
-                features, next_features, actions, rewards, dones, strict=True
+            for x, next_x, a, r, d, bound in zip(
+                features,
+                next_features,
+                actions,
+                rewards,
+                dones,
+                bounds.split(batch_size),
+                strict=True,
             ):
                 self._n_updates += 1
                 with th.no_grad():
                     next_in = th.cat([next_x, actor_target(next_x)], dim=1)
                     next_q = _lowest([net(next_in) for net in critics_target])
                     target_q = (r + (1.0 - d) * self.gamma * next_q).clamp_(low, high)
+                    if self.hindsight_bound:
+                        target_q = th.maximum(target_q, bound)
                 critic_in = th.cat([x, a], dim=1)
                 critic_loss = sum(
                     nn.functional.mse_loss(net(critic_in), target_q) for net in critics
@@ -317,6 +351,15 @@ class HerDDPG(DDPG):
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
             self.logger.record("train/moved_share", self.replay_buffer.moved_share())
 
+    def _sample(self, n: int) -> tuple[DictReplayBufferSamples, th.Tensor]:
+        """Draw n transitions and (n, 1) steps until each one's goal was reached, where known."""
+        buffer = self.replay_buffer
+        assert buffer is not None
+        if isinstance(buffer, FollowObjectReplayBuffer):
+            return buffer.sample_with_steps(n, env=self._vec_normalize_env)
+        data = buffer.sample(n, env=self._vec_normalize_env)
+        return data, th.full((n, 1), th.inf, device=self.device)
+
     def _trained_parameters(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
         """Parameters of the live and of the target networks, in the same order."""
         live: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
@@ -325,6 +368,17 @@ class HerDDPG(DDPG):
             *self.critic_target.parameters(),
         ]
         return live, target
+
+
+@contextmanager
+def _matmul_precision(precision: str) -> Iterator[None]:
+    """Multiply float32 matrices with this precision for a while."""
+    earlier = th.get_float32_matmul_precision()
+    th.set_float32_matmul_precision(precision)
+    try:
+        yield
+    finally:
+        th.set_float32_matmul_precision(earlier)
 
 
 def _lowest(q_values: list[th.Tensor]) -> th.Tensor:

@@ -318,6 +318,17 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         Raises:
             RuntimeError: before the end of the first episode.
         """
+        return self.sample_with_steps(batch_size, env)[0]
+
+    def sample_with_steps(
+        self, batch_size: int, env: VecNormalize | None = None
+    ) -> tuple[DictReplayBufferSamples, th.Tensor]:
+        """Draw as `sample` does, and say how soon the episode itself reached each goal.
+
+        Returns:
+            The transitions, and (batch_size, 1) float: -1s that the episode was paid from the
+            transition until it stood on the hindsight goal; infinite where the goal shown is kept.
+        """
         if self.table.n_transitions() == 0:
             raise RuntimeError(
                 "the replay buffer holds no finished episode yet; "
@@ -332,16 +343,19 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         next_obs = {key: self._take(store, flat) for key, store in self.next_observations.items()}
         rewards = self._take(self.rewards, flat)
 
+        steps_to_goal = np.full(batch_size, np.inf)
         virtual = np.flatnonzero(self.rng.random(batch_size) < self.her_ratio)
         if len(virtual):
-            goals = self._hindsight_goals(row[virtual], step[virtual])
+            goals, steps = self._hindsight_goals(row[virtual], step[virtual])
             if self.min_goal_distance > 0.0:
                 far = np.linalg.norm(goals - self._origin(row[virtual]), axis=1)
                 kept = far >= self.min_goal_distance
-                virtual, goals = virtual[kept], goals[kept]
+                virtual, goals, steps = virtual[kept], goals[kept], steps[kept]
             if self.imagined_ratio > 0.0:
                 chosen = np.flatnonzero(self.rng.random(len(virtual)) < self.imagined_ratio)
                 goals[chosen] = self._imagined_goals(row[virtual[chosen]])
+                steps[chosen] = np.inf
+            steps_to_goal[virtual] = steps
             obs["desired_goal"][virtual] = goals
             next_obs["desired_goal"][virtual] = goals
             infos = list(self.infos[slot, env_idx][virtual]) if self.copy_info_dict else []
@@ -351,13 +365,14 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         obs = self._normalize_obs(obs, env)  # type: ignore[assignment]
         next_obs = self._normalize_obs(next_obs, env)  # type: ignore[assignment]
         rewards = self._normalize_reward(rewards, env)
-        return DictReplayBufferSamples(
+        samples = DictReplayBufferSamples(
             observations={key: self._to_tensor(value) for key, value in obs.items()},
             actions=self._to_tensor(self._take(self.actions, flat)),
             next_observations={key: self._to_tensor(value) for key, value in next_obs.items()},
             dones=self._to_tensor(dones).reshape(-1, 1),
             rewards=self._to_tensor(rewards).reshape(-1, 1),
         )
+        return samples, self._to_tensor(steps_to_goal).reshape(-1, 1)
 
     def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         row, step = self.table.draw(n, self.rng)
@@ -373,19 +388,26 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
     def _to_tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.device)
 
-    def _hindsight_goals(self, row: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Achieved goals of the same episode, by the goal selection strategy (n, d)."""
+    def _hindsight_goals(
+        self, row: np.ndarray, step: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Achieved goals of the same episode, by the goal selection strategy (n, d).
+
+        Second, the steps from the transition to the one that achieved the goal (n,), float;
+        infinite for goals of the past.
+        """
         length = self.table.length[row]
         if self.goal_selection_strategy == GoalSelectionStrategy.FINAL:
-            step = length - 1
+            chosen = length - 1
         elif self.goal_selection_strategy == GoalSelectionStrategy.FUTURE:
-            step = self.rng.integers(step, length)
+            chosen = self.rng.integers(step, length)
         else:
-            step = self.rng.integers(0, length)
-        slot = (self.table.start[row] + step) % self.buffer_size
-        return self._take(
+            chosen = self.rng.integers(0, length)
+        slot = (self.table.start[row] + chosen) % self.buffer_size
+        goals = self._take(
             self.next_observations["achieved_goal"], slot * self.n_envs + self.table.env[row]
         )
+        return goals, np.where(chosen >= step, chosen - step, np.inf)
 
     def _origin(self, row: np.ndarray) -> np.ndarray:
         """Achieved goals that the episodes began with (n, d)."""

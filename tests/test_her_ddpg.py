@@ -82,6 +82,31 @@ def test_targets_are_clipped() -> None:
     assert float((q + 2.0).abs().mean()) < 0.2
 
 
+def test_targets_are_no_lower_than_the_episode_proves() -> None:
+    """With every other target at its lowest the critic learns the bounds themselves."""
+    model = make_model(target_clip=(-10.0, -10.0), learning_rate=3e-3, hindsight_bound=True)
+    model.learn(1200, log_interval=None)  # type: ignore[arg-type]
+    model.train(600, 64)
+    data, steps = model._sample(500)
+    known = th.isfinite(steps)
+    bound = (0.9**steps - 1.0) / (1.0 - 0.9)
+    with th.no_grad():
+        q = model.critic(data.observations, data.actions)[0]
+    assert float((q - bound)[known].abs().mean()) < 2.0 < float(q[known].mean() + 10.0)
+
+
+def test_matmul_precision_is_that_of_the_update_alone() -> None:
+    before = th.get_float32_matmul_precision()
+    q_values = []
+    for precision in ("highest", "medium"):
+        model = make_model(matmul_precision=precision)
+        model.learn(400, log_interval=None)  # type: ignore[arg-type]
+        assert th.get_float32_matmul_precision() == before
+        data = make_model().env.reset()  # type: ignore[union-attr]
+        q_values.append(model.predict(data, deterministic=True)[0])
+    np.testing.assert_allclose(q_values[0], q_values[1], atol=0.5)
+
+
 def test_action_l2_keeps_actions_small() -> None:
     sizes = []
     for weight in (0.0, 10.0):
@@ -192,6 +217,7 @@ def test_environment_without_goals_is_refused() -> None:
         ({"random_action_prob": 1.5}, "random_action_prob is 1.5; it must lie in"),
         ({"noise_std": -1.0}, "must be >= 0"),
         ({"target_update_interval": 0}, "target_update_interval is 0"),
+        ({"matmul_precision": "low"}, "matmul_precision is 'low'"),
         ({"policy_kwargs": {"features_extractor_class": object}}, "leave features_extractor"),
         ({"target_clip": "wide"}, "target_clip is 'wide'"),
     ],

@@ -68,6 +68,24 @@ def as_arrays(samples: Any) -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.parametrize("strategy", ["future", "final", "episode"])
+def test_steps_to_a_hindsight_goal_are_those_of_the_episode(strategy: str) -> None:
+    """The goal is where the episode stood so many steps later, and reward 0 means none."""
+    env = make_env()
+    buffer = make_buffer(env, goal_selection_strategy=strategy)
+    fill([buffer], env, 5 * HORIZON)
+    samples, steps = buffer.sample_with_steps(4000)
+    got, steps_to_goal = as_arrays(samples), steps.numpy().ravel()
+    known = np.isfinite(steps_to_goal)
+    assert 0.3 < known.mean() < 0.9 and got["reward"][steps_to_goal == 0].max() == 0.0
+    stored = buffer.observations["observation"][: buffer.pos].reshape(-1, 3)
+    achieved = buffer.next_observations["achieved_goal"][: buffer.pos].reshape(-1, 3)
+    for i in np.flatnonzero(known)[:200]:
+        (at,) = np.flatnonzero((stored == got["obs"][i]).all(axis=1))
+        later = int(at + steps_to_goal[i] * env.num_envs)
+        np.testing.assert_array_equal(achieved[later], got["goal"][i])
+
+
 def test_relabelled_reward_is_the_environments() -> None:
     env = make_env()
     buffer = make_buffer(env)
