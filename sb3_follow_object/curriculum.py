@@ -15,12 +15,15 @@ class Curriculum:
 
     Each episode shows its original goal with probability ``p`` and otherwise the imagined goal of
     a level k drawn from U{1..k_max}. A test at level k_max that reaches ``threshold`` raises k_max
-    by one. At the last level the curriculum is finished and shows original goals only.
+    by one. Once the last level is reached (and passed, with ``finish_threshold``) the curriculum is
+    finished and shows original goals only.
 
     Args:
         horizon: T, steps of an episode, >= 1.
         p: probability of the original goal, in [0, 1].
         threshold: success rate at k_max that raises k_max, in [0, 1].
+        finish_threshold: success rate at the last level that ends the curriculum, in [0, 1]; until
+            then imagined goals of all levels go on. 0 is the paper's: reaching that level ends it.
         k_max: first value of k_max, in 1..n_levels.
         levels: "time": level k is k time-steps along the path (paper), so there are T levels;
             "path": level k is the share k / n_levels of the path's length.
@@ -38,6 +41,7 @@ class Curriculum:
         *,
         p: float = 0.2,
         threshold: float = 0.25,
+        finish_threshold: float = 0.0,
         k_max: int = 2,
         levels: str = "time",
         n_levels: int = 25,
@@ -50,6 +54,7 @@ class Curriculum:
         _check_integer("n_levels", n_levels, 1, None)
         _check_share("p", p)
         _check_share("threshold", threshold)
+        _check_share("finish_threshold", finish_threshold)
         if not 0.0 <= min_distance < np.inf:
             raise ValueError(f"min_distance must be >= 0 metres and finite, got {min_distance!r}.")
         self.horizon = int(horizon)
@@ -57,14 +62,17 @@ class Curriculum:
         self.n_levels = self.horizon if levels == "time" else int(n_levels)
         self.p = float(p)
         self.threshold = float(threshold)
+        self.finish_threshold = float(finish_threshold)
         self.sampling = sampling
         self.min_distance = float(min_distance)
         self.k_max = self._checked_level("k_max", k_max)
+        self._passed_last = False
 
     @property
     def finished(self) -> bool:
-        """Whether the last level is reached, so that only original goals are shown."""
-        return self.k_max == self.n_levels
+        """Whether the last level is passed, so that only original goals are shown."""
+        at_last = self.k_max == self.n_levels
+        return at_last and (self._passed_last or self.finish_threshold == 0.0)
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw the coin and the level of ``n`` new episodes.
@@ -90,7 +98,7 @@ class Curriculum:
         return np.arange(first, self.k_max + 1)
 
     def report(self, success_rate: float) -> bool:
-        """Take in a test at level k_max; return whether k_max grew.
+        """Take in a test at level k_max; return whether k_max grew or the curriculum ended.
 
         Args:
             success_rate: share of successful test episodes, in [0, 1].
@@ -99,14 +107,23 @@ class Curriculum:
             ValueError: ``success_rate`` is outside [0, 1].
         """
         _check_share("success_rate", success_rate)
-        if self.finished or success_rate < self.threshold:
+        at_last = self.k_max == self.n_levels
+        if self.finished or success_rate < (self.finish_threshold if at_last else self.threshold):
             return False
-        self.k_max += 1
+        if at_last:
+            self._passed_last = True
+        else:
+            self.k_max += 1
         return True
 
     def state_dict(self) -> dict[str, Any]:
         """Return what training has changed, and what it only makes sense with (JSON types)."""
-        return {"k_max": self.k_max, "levels": self.levels, "n_levels": self.n_levels}
+        return {
+            "k_max": self.k_max,
+            "passed_last": self._passed_last,
+            "levels": self.levels,
+            "n_levels": self.n_levels,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state``, made by ``state_dict`` of a curriculum with the same levels.
@@ -114,7 +131,7 @@ class Curriculum:
         Raises:
             ValueError: the state lacks an entry, has other levels, or a k_max outside them.
         """
-        missing = {"k_max", "levels", "n_levels"} - set(state)
+        missing = {"k_max", "passed_last", "levels", "n_levels"} - set(state)
         if missing:
             raise ValueError(f"The curriculum's state lacks {sorted(missing)}.")
         theirs = (state["levels"], state["n_levels"])
@@ -124,6 +141,7 @@ class Curriculum:
                 f"but this curriculum has levels={self.levels!r} with {self.n_levels}."
             )
         self.k_max = self._checked_level("k_max", state["k_max"])
+        self._passed_last = bool(state["passed_last"])
 
     def _checked_level(self, name: str, level: int) -> int:
         _check_integer(name, level, 1, self.n_levels)

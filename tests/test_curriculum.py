@@ -77,9 +77,9 @@ def test_state_passes_through_json() -> None:
     "state",
     [
         {},
-        {"k_max": 51, "levels": "time", "n_levels": 50},
-        {"k_max": 2.5, "levels": "time", "n_levels": 50},
-        {"k_max": 2, "levels": "path", "n_levels": 25},
+        {"k_max": 51, "passed_last": False, "levels": "time", "n_levels": 50},
+        {"k_max": 2.5, "passed_last": False, "levels": "time", "n_levels": 50},
+        {"k_max": 2, "passed_last": False, "levels": "path", "n_levels": 25},
     ],
 )
 def test_a_state_of_another_curriculum_is_refused(state: dict[str, Any]) -> None:
@@ -187,3 +187,16 @@ def test_without_a_far_level_up_to_k_max_the_goal_is_the_original(sampling: str)
     shown, level = draw_goals(toy.StraightPredictor(), curriculum, path[:, 0], goal, RNG(0))
     np.testing.assert_array_equal(shown, goal)
     assert not level.any()
+
+
+def test_finish_threshold_keeps_imagining_until_the_last_level_is_passed() -> None:
+    curriculum = Curriculum(3, k_max=3, threshold=0.1, finish_threshold=0.5, p=0.0)
+    assert not curriculum.report(0.4) and not curriculum.finished
+    assert not curriculum.draw(100, np.random.default_rng(0))[0].any()
+    resumed = Curriculum(3, finish_threshold=0.5)
+    resumed.load_state_dict(curriculum.state_dict())
+    assert not resumed.finished
+    assert curriculum.report(0.5) and curriculum.finished and curriculum.k_max == 3
+    assert curriculum.draw(100, np.random.default_rng(0))[0].all()
+    resumed.load_state_dict(curriculum.state_dict())
+    assert resumed.finished and not resumed.report(1.0)
