@@ -13,7 +13,7 @@ ifeq ($(shell uname -s),Linux)
 export MUJOCO_GL ?= egl
 endif
 
-.PHONY: train test lint test-mujoco-range clean
+.PHONY: train test lint bench test-mujoco-range clean
 
 train: $(INSTALLED)
 	$(BIN)/sb3-follow-object train --env $(ENV) --run $(RUN) --resume-or-start
@@ -24,6 +24,11 @@ test: lint
 # Builds throwaway environments with the lowest and the highest mujoco that pyproject.toml admits.
 test-mujoco-range: $(INSTALLED)
 	$(BIN)/pytest -q -m mujoco_range
+
+# Against stock SB3, Gymnasium-Robotics and EnvPool; a quarter of an hour on a machine left alone.
+bench: $(INSTALLED)
+	$(BIN)/pip install -c constraints.txt -e '.[bench]' --no-build-isolation
+	$(BIN)/python benchmarks/speed.py
 
 # mypy reads no setuptools package-dir, so it is shown the package in the shape that is installed.
 lint: $(INSTALLED)

@@ -160,7 +160,12 @@ def replay() -> Iterator[Figure]:
     buffers = []
     for buffer_class in (FollowObjectReplayBuffer, HerReplayBuffer):
         buffer = buffer_class(
-            size, env.observation_space, env.action_space, env, "cpu", n_envs  # type: ignore[arg-type]
+            size,
+            env.observation_space,
+            env.action_space,
+            env,
+            "cpu",
+            n_envs,  # type: ignore[arg-type]
         )
         _fill(buffer, env, size // n_envs, 50)
         buffers.append(buffer)
@@ -348,7 +353,9 @@ def main() -> None:
                     versus = "" if row["ratio"] is None else f"{row['baseline']:>12,.1f}"
                     ratio = "" if row["ratio"] is None else f"{row['ratio']:.2f}x"
                     name, against = row["name"], row["baseline_name"] or ""
-                    print(f"{name:34}{row['ours']:>12,.1f}  {versus}  {ratio} {against}", flush=True)
+                    print(
+                        f"{name:34}{row['ours']:>12,.1f}  {versus}  {ratio} {against}", flush=True
+                    )
         arithmetic_share(figures)
     if arguments.only:
         return
