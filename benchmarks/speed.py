@@ -18,6 +18,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -204,7 +205,7 @@ def update_flops(batch: int, inputs: int, actions: int) -> float:
 
     def network(n_in: int, n_out: int) -> float:
         sizes = [n_in, *HIDDEN, n_out]
-        return 2.0 * batch * sum(a * b for a, b in zip(sizes, sizes[1:], strict=False))
+        return 2.0 * batch * sum(a * b for a, b in pairwise(sizes))
 
     actor, critic = network(inputs, actions), network(inputs + actions, 1)
     # Targets: one pass of each. Critic: forward, and backward for weights and for activations.
@@ -315,6 +316,14 @@ def compare(figure: Figure, rounds: int) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def _line(row: dict[str, Any]) -> str:
+    """One line of the table."""
+    line = f"{row['name']:34}{row['ours']:>12,.1f}"
+    if row["ratio"] is None:
+        return line
+    return f"{line}  {row['baseline']:>12,.1f}  {row['ratio']:.2f}x {row['baseline_name']}"
 
 
 @contextmanager
