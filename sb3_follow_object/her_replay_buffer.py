@@ -388,9 +388,7 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
     def _to_tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.device)
 
-    def _hindsight_goals(
-        self, row: np.ndarray, step: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _hindsight_goals(self, row: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Achieved goals of the same episode, by the goal selection strategy (n, d).
 
         Second, the steps from the transition to the one that achieved the goal (n,), float;
