@@ -24,7 +24,7 @@ from stable_baselines3.common.type_aliases import (
 from torch import nn
 
 from .her_replay_buffer import FollowObjectReplayBuffer
-from .policies import HerPolicy, NormalizedGoalExtractor
+from .policies import HerPolicy
 
 SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 
@@ -219,16 +219,10 @@ class HerDDPG(DDPG):
         if len(rows) == 0:
             return
         rows %= buffer.buffer_size
-        obs = {
-            key: th.from_numpy(store[rows].reshape(len(rows) * self.n_envs, -1))
-            for key, store in buffer.observations.items()
-        }
-        extractor = self.actor.features_extractor
-        assert isinstance(extractor, NormalizedGoalExtractor)
+        obs = buffer.observations["observation"][rows].reshape(len(rows) * self.n_envs, -1)
         for key in ("desired_goal", "achieved_goal"):
-            goals = buffer.next_observations[key][rows].reshape(len(rows) * self.n_envs, -1)
-            inputs = extractor.inputs({**obs, "desired_goal": th.from_numpy(goals)})
-            self.moments.update(inputs.numpy().astype(np.float64))
+            goals = buffer.next_observations[key][rows].reshape(len(obs), -1)
+            self.moments.update(np.concatenate([obs, goals], axis=1).astype(np.float64))
         self.policy.set_moments(
             th.as_tensor(self.moments.mean, dtype=th.float32),
             th.as_tensor(np.sqrt(self.moments.var).clip(min=_MIN_STD), dtype=th.float32),

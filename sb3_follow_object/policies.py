@@ -24,36 +24,24 @@ class NormalizedGoalExtractor(BaseFeaturesExtractor):
     so they are saved with the policy and `predict` takes raw observations.
 
     Args:
-        observation_space: Dict with "observation", "achieved_goal" and "desired_goal".
+        observation_space: Dict with "observation" and "desired_goal".
         clip: bound on each standardised entry, in standard deviations.
-        relative_goal: whether the way that is left, desired minus achieved goal, is appended.
     """
 
     mean: th.Tensor
     std: th.Tensor
 
-    def __init__(
-        self, observation_space: spaces.Dict, clip: float = 5.0, relative_goal: bool = False
-    ):
+    def __init__(self, observation_space: spaces.Dict, clip: float = 5.0):
         self.keys = ("observation", "desired_goal")
-        dims = {key: get_flattened_obs_dim(space) for key, space in observation_space.items()}
-        dim = sum(dims[key] for key in self.keys) + relative_goal * dims["desired_goal"]
+        dim = sum(get_flattened_obs_dim(observation_space[key]) for key in self.keys)
         super().__init__(observation_space, dim)
         self.clip = clip
-        self.relative_goal = relative_goal
         self.register_buffer("mean", th.zeros(dim))
         self.register_buffer("std", th.ones(dim))
 
-    def inputs(self, observations: dict[str, th.Tensor]) -> th.Tensor:
-        """Return what is standardised, (n, features_dim)."""
-        parts = [observations[key].float() for key in self.keys]
-        if self.relative_goal:
-            parts.append((observations["desired_goal"] - observations["achieved_goal"]).float())
-        return th.cat(parts, dim=-1)
-
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
         """Map a batch of observations to features (n, features_dim)."""
-        inputs = self.inputs(observations)
+        inputs = th.cat([observations[key].float() for key in self.keys], dim=-1)
         return ((inputs - self.mean) / self.std).clamp_(-self.clip, self.clip)
 
 
@@ -79,7 +67,6 @@ class HerPolicy(TD3Policy):
     Args:
         critic_layer_norm: LayerNorm after each hidden layer of the critics. Beyond the paper.
         features_clip: see `NormalizedGoalExtractor`.
-        relative_goal: likewise. Beyond the paper: the networks need not learn to subtract.
 
     The other arguments are TD3Policy's.
     """
@@ -92,7 +79,6 @@ class HerPolicy(TD3Policy):
         net_arch: list[int] | dict[str, list[int]] | None = None,
         critic_layer_norm: bool = False,
         features_clip: float = 5.0,
-        relative_goal: bool = False,
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
@@ -107,7 +93,7 @@ class HerPolicy(TD3Policy):
             lr_schedule,
             net_arch=[256, 256, 256] if net_arch is None else net_arch,
             features_extractor_class=NormalizedGoalExtractor,
-            features_extractor_kwargs={"clip": features_clip, "relative_goal": relative_goal},
+            features_extractor_kwargs={"clip": features_clip},
             # One kernel for all parameters: the update is memory-bound otherwise.
             optimizer_kwargs={"fused": True, **(optimizer_kwargs or {})},
             **kwargs,
@@ -138,17 +124,7 @@ def save_actor(path: str | os.PathLike[str], actor: Actor, env_id: str) -> None:
         actor: of a `HerPolicy`.
         env_id: the task that it was trained for.
     """
-    extractor = actor.features_extractor
-    assert isinstance(extractor, NormalizedGoalExtractor)
-    save_tree(
-        path,
-        {
-            "env_id": env_id,
-            "net_arch": actor.net_arch,
-            "relative_goal": extractor.relative_goal,
-            "actor": actor.state_dict(),
-        },
-    )
+    save_tree(path, {"env_id": env_id, "net_arch": actor.net_arch, "actor": actor.state_dict()})
 
 
 def load_actor(
@@ -164,8 +140,7 @@ def load_actor(
     """
     saved = load_tree(path)
     try:
-        relative_goal = bool(saved.get("relative_goal", False))  # absent in older files
-        extractor = NormalizedGoalExtractor(observation_space, relative_goal=relative_goal)
+        extractor = NormalizedGoalExtractor(observation_space)
         actor = Actor(
             observation_space, action_space, saved["net_arch"], extractor, extractor.features_dim
         )

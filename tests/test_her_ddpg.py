@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -133,26 +132,6 @@ def test_inputs_are_standardised_by_what_is_stored() -> None:
         {key: th.full((1, 3), 1e6) for key in ("observation", "achieved_goal", "desired_goal")}
     )
     assert features.max() == 5.0
-
-
-def test_relative_goal_is_an_input_and_travels_with_the_policy(tmp_path: Path) -> None:
-    kwargs = {"net_arch": [32, 32], "relative_goal": True}
-    model = make_model(policy_kwargs=kwargs)
-    model.learn(1000, log_interval=None)  # type: ignore[arg-type]
-    obs = {key: th.zeros(1, 3) for key in ("observation", "achieved_goal", "desired_goal")}
-    moved = {**obs, "achieved_goal": th.full((1, 3), 0.1)}
-    features = model.actor.features_extractor
-    assert features(obs).shape == (1, 9)
-    assert (features(moved) - features(obs))[0, 6:].max() < 0.0
-    assert model.env is not None
-    save_actor(tmp_path / "policy", model.actor, "toy")
-    space: Any = model.observation_space
-    actor, _ = load_actor(tmp_path / "policy", space, model.action_space)  # type: ignore[arg-type]
-    batch = model.env.reset()
-    np.testing.assert_array_equal(
-        actor.predict(batch, deterministic=True)[0],  # type: ignore[arg-type]
-        model.predict(batch, deterministic=True)[0],  # type: ignore[arg-type]
-    )
 
 
 def test_exploration_mixes_uniform_actions_and_noise() -> None:
