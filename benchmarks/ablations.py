@@ -1,0 +1,96 @@
+"""Collect runs that differ from the default preset in a setting or two into one table.
+
+    python benchmarks/ablations.py runs/ab-*
+
+Writes benchmarks/ablations.csv: a row a run with what differs, when the curriculum passed each fifth
+of its levels, when 0.9 of the validation episodes first succeeded, and the final test. Prints it as
+Markdown. Runs need not be finished: the last two columns are then empty.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from sb3_follow_object.config import run_config
+
+OUT = Path(__file__).with_name("ablations.csv")
+LIMITS = {"total_timesteps", "settings.n_threads", "seed"}
+
+
+def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings by their dotted names."""
+    leaves: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            leaves |= flat(value, f"{prefix}{name}.")
+        else:
+            leaves[f"{prefix}{name}"] = list(value) if isinstance(value, tuple) else value
+    return leaves
+
+
+def difference(config: dict[str, Any]) -> str:
+    """Say what a run's settings change in the default preset of its method."""
+    default = run_config(config["env_id"], method=config["method"], seed=config["seed"])
+    ours, theirs = flat(config), flat(asdict(default))
+    changed = [
+        f"{name.removeprefix('settings.').removeprefix('algorithm.')}={ours.get(name)}"
+        for name in sorted({*ours, *theirs} - LIMITS)
+        if ours.get(name) != theirs.get(name)
+    ]
+    return ", ".join(changed) or "default"
+
+
+def read_row(run: Path) -> dict[str, Any]:
+    """Return a run's row."""
+    config = json.loads((run / "config.json").read_text())
+    with open(run / "evaluations.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+
+    def first(column: str, value: float) -> str:
+        hits = (row["env_steps"] for row in rows if row[column] and float(row[column]) >= value)
+        return next(hits, "")
+
+    result = {}
+    if (run / "result.json").exists():
+        result = json.loads((run / "result.json").read_text())
+    levels = config["settings"].get("curriculum", {}).get("n_levels", 25)
+    if config["settings"].get("curriculum", {}).get("levels") != "path":
+        levels = 50
+    return {
+        "task": config["env_id"].removeprefix("FollowObject/").removesuffix("-v0"),
+        "seed": config["seed"],
+        "setting": difference(config),
+        **{f"k_{share}": first("k_max", share / 100 * levels) for share in (20, 40, 60, 80, 100)},
+        "validated_0.9": first("success_rate", 0.9),
+        "last_steps": rows[-1]["env_steps"] if rows else "",
+        "last_validation": rows[-1]["success_rate"] if rows else "",
+        "success_rate": result.get("success_rate", ""),
+        "commit": json.loads((run / "versions.json").read_text())["commit"],
+    }
+
+
+def main() -> None:
+    """Collect the runs named on the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", nargs="+", type=Path)
+    rows = sorted(
+        (read_row(run) for run in parser.parse_args().runs),
+        key=lambda row: (row["task"], row["setting"] != "default", row["setting"], row["seed"]),
+    )
+    with open(OUT, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    shown = [name for name in rows[0] if name != "commit"]
+    print("| " + " | ".join(shown) + " |\n" + "|---" * len(shown) + "|")
+    for row in rows:
+        print("| " + " | ".join(str(row[name]) for name in shown) + " |")
+
+
+if __name__ == "__main__":
+    main()
