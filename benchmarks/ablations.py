@@ -2,9 +2,9 @@
 
     python benchmarks/ablations.py runs/ab-*
 
-Writes benchmarks/ablations.csv: a row a run with what differs, when the curriculum passed each fifth
-of its levels, when 0.9 of the validation episodes first succeeded, and the final test. Prints it as
-Markdown. Runs need not be finished: the last two columns are then empty.
+Writes benchmarks/ablations.csv: a row a run with what differs, when the curriculum passed each
+fifth of its levels, when 0.9 of the validation episodes first succeeded, and the final test. Prints
+it as Markdown. Runs need not be finished: the final test is then empty.
 """
 
 from __future__ import annotations
