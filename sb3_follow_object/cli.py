@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from .methods import METHODS
+
 # Nothing heavier here: --help must not wait for torch. The commands import what they use.
 
 if TYPE_CHECKING:
@@ -58,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     train.set_defaults(run_command=_train)
     train.add_argument("--run", type=Path, required=True, metavar="FOLDER", help="run folder")
     _add_settings(train)
-    train.add_argument("--method", choices=("fo", "her"), help="default: fo")
+    train.add_argument("--method", choices=METHODS, help="default: fo")
     train.add_argument("--steps", type=int, metavar="N", help="env steps, all stages counted")
     train.add_argument("--n-envs", type=int, metavar="N", help="parallel copies of the robot")
     train.add_argument(

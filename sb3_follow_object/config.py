@@ -17,6 +17,8 @@ import yaml
 from stable_baselines3.td3.policies import TD3Policy
 
 from . import zoo_configs
+from .auxiliary import REWARDS, reward_class
+from .cher import GoalSelection
 from .curriculum import Curriculum
 from .envs import IDS, object_id
 from .envs.tasks import did_you_mean
@@ -25,15 +27,20 @@ from .follow_object import FollowObject
 from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
 from .her_replay_buffer import FollowObjectReplayBuffer
+from .methods import METHODS as METHODS
 from .policies import HerPolicy
 
-METHODS = ("fo", "her")
 PRESETS = ("default", "paper")
 
 _GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 WRAPPER = "sb3_follow_object.ImaginedGoalWrapper"
 CALLBACK = "sb3_follow_object.CurriculumCallback"
+# What makes an entry this or that method.
+_MARKS = (
+    f"fo has env_wrapper {WRAPPER}, shaped reward_type dense, cher a setting "
+    "replay_buffer_kwargs.cher, and the auxiliary reward gives its name"
+)
 # The callback's keyword arguments, and what FollowObject calls them.
 _CALLBACK_NAMES = {"every": "test_every", "n_episodes": "n_test_episodes", "store": "store_tests"}
 
@@ -42,7 +49,7 @@ _NOT_SETTINGS = {"self", "env", "env_id", "seed", "settings", "method", "imagine
 _NOT_SETTINGS |= {"predictor", "report", "_init_setup_model", "tensorboard_log", "action_noise"}
 _NOT_SETTINGS |= {"replay_buffer_class", "total_timesteps", "horizon", "args", "kwargs"}
 _NOT_SETTINGS |= {"observation_space", "action_space", "lr_schedule", "reward_function"}
-_NOT_SETTINGS |= {"paths", "goals", "physics", "progress"}
+_NOT_SETTINGS |= {"paths", "goals", "physics", "progress", "n_features"}
 
 _AT_LEAST_ONE = {"n_timesteps", "batch_size", "buffer_size", "gradient_steps", "n_paths"}
 _AT_LEAST_ONE |= {"object_timesteps", "object_n_envs", "test_every", "n_test_episodes", "n_threads"}
@@ -67,7 +74,7 @@ def run_config(
 
     Args:
         env_id: the task; the file must have an entry for it, or one named "default".
-        method: "fo" or "her"; None takes what the file trains, without a file "fo".
+        method: one of `METHODS`; None takes what the file trains, without a file "fo".
         preset: "default" or "paper", of the files that come with the package.
         file: YAML in rl_zoo3's layout, in place of a preset.
         seed: of the run.
@@ -85,12 +92,6 @@ def run_config(
     entries = read_yaml(path)
     entry = _entry(entries, env_id, path)
     imagine = WRAPPER in _named(entry, "env_wrapper", path)
-    found = "fo" if imagine else "her"
-    if method is not None and method != found:
-        raise ValueError(
-            f"{path} trains {env_id} with method {found!r}, not {method!r}: only entries with "
-            f"env_wrapper {WRAPPER} imagine goals"
-        )
     if imagine and env_id not in IDS:
         raise ValueError(
             f"{env_id!r} has no environment of its object alone, which imagined goals come from; "
@@ -106,6 +107,12 @@ def run_config(
         _override(settings, name, value)
     _check(changes, schema, "--set")
     _check(settings, schema, str(path))
+    found = method_of(settings, imagine)
+    if method is not None and method != found:
+        raise ValueError(
+            f"{path} trains {env_id} with method {found!r}{' after --set' * bool(changes)}, "
+            f"not {method!r}: {_MARKS}"
+        )
 
     total_timesteps = settings.pop("n_timesteps", RunConfig.total_timesteps)
     of_run = {name: settings.pop(name) for name in list(settings) if name in schema["run"]}
@@ -121,6 +128,18 @@ def run_config(
         settings=_with_tuples(of_class),
         **of_run,
     )
+
+
+def method_of(settings: Mapping[str, Any], imagine: bool) -> str:
+    """Return the name of the method that settings describe: its marks joined, "her" with none."""
+    auxiliary = settings.get("auxiliary") or {}
+    marks = {
+        "fo": imagine,
+        "shaped": settings.get("reward_type") == "dense",
+        str(auxiliary.get("name")): bool(auxiliary),
+        "cher": (settings.get("replay_buffer_kwargs") or {}).get("cher") is not None,
+    }
+    return "-".join(name for name, marked in marks.items() if marked) or "her"
 
 
 def load_config(folder: str | os.PathLike[str]) -> RunConfig:
@@ -297,10 +316,15 @@ def _parameters(*functions: Callable[..., Any]) -> dict[str, Any]:
 def _schema() -> dict[str, dict[str, Any]]:
     """Return everything that can be set and its default; a dict has settings of its own."""
     algorithm = _parameters(HerDDPG.__init__)
+    algorithm["target_clip"] = None  # a pair, a word or nothing: the algorithm judges
     buffer = _parameters(FollowObjectReplayBuffer.__init__)
     for name in ("buffer_size", "device", "n_envs", "optimize_memory_usage"):
         del buffer[name]  # the algorithm's
+    buffer["cher"] = _parameters(GoalSelection.__init__)
     algorithm["replay_buffer_kwargs"] = buffer
+    algorithm["auxiliary"] = {"name": "rnd", "weight": 1.0}
+    for name in REWARDS:  # which settings belong to which reward is the algorithm's to check
+        algorithm["auxiliary"] |= _parameters(reward_class(name).__init__)
     algorithm["policy_kwargs"] = _parameters(TD3Policy.__init__, HerPolicy.__init__)
     of_class = _parameters(FollowObject.__init__)
     of_class["curriculum"] = _parameters(Curriculum.__init__)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -23,8 +21,10 @@ from stable_baselines3.common.type_aliases import (
 )
 from torch import nn
 
+from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .policies import HerPolicy
+from .tensors import lowest, matmul_at
 
 SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 
@@ -46,7 +46,8 @@ class HerDDPG(DDPG):
     - the actor's loss has `action_l2` times the mean squared action added;
     - with probability `random_action_prob` an action is uniform, else Gaussian noise is added;
     - episodes may be collected from several environments at once: `train_freq=(n, "episode")`;
-    - target networks may be moved once every `target_update_interval` updates.
+    - target networks may be moved once every `target_update_interval` updates;
+    - a second reward with a critic of its own may be added: `auxiliary`.
 
     Args:
         env: with Dict observations "observation", "achieved_goal", "desired_goal".
@@ -65,6 +66,10 @@ class HerDDPG(DDPG):
         matmul_precision: of the float32 matrix products of an update, as in
             `torch.set_float32_matmul_precision`: "medium" lets processors with bfloat16 units
             multiply in bfloat16 and add up in float32, which is faster; others ignore it.
+        auxiliary: a second reward, whose critic the actor maximises beside the main one:
+            {"name": "rnd"} (or a subclass of `AuxiliaryReward` as the name),
+            with the keyword arguments of the reward's class and "weight", 1 by default, of its
+            critic. Its targets have bounds of their own; `hindsight_bound` does not touch them.
         policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.
 
     The other arguments are DDPG's.
@@ -101,6 +106,7 @@ class HerDDPG(DDPG):
         hindsight_bound: bool = False,
         target_update_interval: int = 1,
         matmul_precision: str = "highest",
+        auxiliary: dict[str, Any] | None = None,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
@@ -112,7 +118,7 @@ class HerDDPG(DDPG):
             raise ValueError(f"random_action_prob is {random_action_prob}; it must lie in [0, 1]")
         if noise_std < 0.0 or action_l2 < 0.0:
             raise ValueError(f"noise_std ({noise_std}) and action_l2 ({action_l2}) must be >= 0")
-        if isinstance(target_clip, str) and target_clip != "auto":
+        if not (target_clip is None or target_clip == "auto" or _is_interval(target_clip)):
             raise ValueError(f'target_clip is {target_clip!r}; give (low, high), "auto" or None')
         if target_update_interval < 1:
             raise ValueError(f"target_update_interval is {target_update_interval}; must be >= 1")
@@ -149,6 +155,8 @@ class HerDDPG(DDPG):
         self.hindsight_bound = hindsight_bound
         self.target_update_interval = target_update_interval
         self.matmul_precision = matmul_precision
+        self.auxiliary = auxiliary
+        self.auxiliary_critic: AuxiliaryCritic | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -162,11 +170,22 @@ class HerDDPG(DDPG):
             )
         if self.gamma is None:
             self.gamma = 1.0 - 1.0 / self._horizon()
+        if self.auxiliary is not None:
+            if self._vec_normalize_env is not None:
+                raise ValueError(
+                    "auxiliary rewards read raw observations; leave VecNormalize (rl_zoo3's "
+                    "normalize) out: HerDDPG standardises its inputs itself"
+                )
+            self.auxiliary = resolve_auxiliary(self.auxiliary, self.env)
         super()._setup_model()
         self.rng = np.random.default_rng(np.random.randint(2**31))
         if not hasattr(self, "moments"):  # SB3's load() brings them before it comes here
             self.moments = RunningMeanStd(shape=(self.actor.features_dim,))
         self._moments_pos = 0
+        if self.auxiliary is not None:
+            # Last, so that what is drawn above does not depend on it.
+            rate = self.lr_schedule(1.0)
+            self.auxiliary_critic = make_auxiliary(self.auxiliary, self.policy, rate, self.gamma)
         if isinstance(self.train_freq, TrainFreq) and (
             self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1
         ):
@@ -228,6 +247,16 @@ class HerDDPG(DDPG):
             th.as_tensor(np.sqrt(self.moments.var).clip(min=_MIN_STD), dtype=th.float32),
         )
 
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "auxiliary_critic"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        if self.auxiliary_critic is not None:
+            names.append("auxiliary_critic")
+            names += [f"auxiliary_critic.{name}" for name in self.auxiliary_critic.optimizers]
+        return names, variables
+
     def training_state(self) -> dict[str, Any]:
         """Return everything that the next rollout and update depend on, between rollouts.
 
@@ -237,6 +266,9 @@ class HerDDPG(DDPG):
             "policy": self.policy.state_dict(),
             "actor_optimizer": self.actor.optimizer.state_dict(),
             "critic_optimizer": self.critic.optimizer.state_dict(),
+            "auxiliary": None
+            if self.auxiliary_critic is None
+            else self.auxiliary_critic.training_state(),
             "moments": {
                 "mean": self.moments.mean,
                 "var": self.moments.var,
@@ -253,6 +285,8 @@ class HerDDPG(DDPG):
         self.policy.load_state_dict(state["policy"])
         self.actor.optimizer.load_state_dict(state["actor_optimizer"])
         self.critic.optimizer.load_state_dict(state["critic_optimizer"])
+        if self.auxiliary_critic is not None:
+            self.auxiliary_critic.load_training_state(state["auxiliary"])
         moments = state["moments"]
         self.moments.mean, self.moments.var = moments["mean"].copy(), moments["var"].copy()
         self.moments.count, self._moments_pos = moments["count"], moments["pos"]
@@ -267,58 +301,60 @@ class HerDDPG(DDPG):
             return -1.0 / (1.0 - self.gamma), 0.0
         if self.target_clip is None:
             return -np.inf, np.inf
-        if isinstance(self.target_clip, str):
-            raise ValueError(
-                f'target_clip is {self.target_clip!r}; give (low, high), "auto" or None'
-            )
+        assert not isinstance(self.target_clip, str)  # no other word gets past __init__
         low, high = self.target_clip
         return float(low), float(high)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Take gradient steps; several batches are drawn from the buffer in one call."""
-        with _matmul_precision(self.matmul_precision):
+        with matmul_at(self.matmul_precision):
             self._train(gradient_steps, batch_size)
 
     def _train(self, gradient_steps: int, batch_size: int) -> None:
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
-        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        auxiliary = self.auxiliary_critic
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        self._update_learning_rate(optimizers + ([auxiliary.optimizer] if auxiliary else []))
         self._update_moments()
         low, high = self._target_bounds()
         critics = self.critic.q_networks
         critics_target = self.critic_target.q_networks
         actor, actor_target = self.actor.mu, self.actor_target.mu
         live, target = self._trained_parameters()
-        critic_losses, actor_losses, q_sum = [], [], th.zeros(())
+        critic_losses, actor_losses = [], []
+        q_sum = reward_sum = th.zeros(())
 
         steps_left = gradient_steps
         while steps_left > 0:
             n = min(steps_left, max(1, _SAMPLE_CHUNK // batch_size))
             steps_left -= n
-            data, steps_to_goal = self._sample(n * batch_size)
+            data, steps_to_goal = self._sample(n * batch_size, n)
             bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
-            # All four networks share their input moments, so features are computed once.
-            features = self.actor.features_extractor(data.observations).split(batch_size)
-            next_features = self.actor.features_extractor(data.next_observations).split(batch_size)
-            actions = data.actions.split(batch_size)
-            rewards, dones = data.rewards.split(batch_size), data.dones.split(batch_size)
-            for x, next_x, a, r, d, bound in zip(
-                features,
-                next_features,
-                actions,
-                rewards,
-                dones,
+            # All networks share their input moments, so features are computed once.
+            chunk = Transitions(
+                data.observations,
+                data.actions,
+                data.next_observations,
+                self.actor.features_extractor(data.observations),
+                self.actor.features_extractor(data.next_observations),
+            )
+            for batch, r, d, bound in zip(
+                chunk.split(batch_size),
+                data.rewards.split(batch_size),
+                data.dones.split(batch_size),
                 bounds.split(batch_size),
                 strict=True,
             ):
+                x, next_x = batch.features, batch.next_features
                 self._n_updates += 1
                 with th.no_grad():
                     next_in = th.cat([next_x, actor_target(next_x)], dim=1)
-                    next_q = _lowest([net(next_in) for net in critics_target])
+                    next_q = lowest([net(next_in) for net in critics_target])
                     target_q = (r + (1.0 - d) * self.gamma * next_q).clamp_(low, high)
                     if self.hindsight_bound:
                         target_q = th.maximum(target_q, bound)
-                critic_in = th.cat([x, a], dim=1)
+                critic_in = th.cat([x, batch.actions], dim=1)
                 critic_loss = sum(
                     nn.functional.mse_loss(net(critic_in), target_q) for net in critics
                 )
@@ -326,12 +362,16 @@ class HerDDPG(DDPG):
                 self.critic.optimizer.zero_grad()
                 critic_loss.backward()
                 self.critic.optimizer.step()
+                if auxiliary is not None:
+                    auxiliary.update(batch, critic_in, next_in, d)
 
                 # The actor's gradient passes through the critic, whose own is not wanted.
                 self.critic.requires_grad_(False)
                 policy_actions = actor(x)
-                q = critics[0](th.cat([x, policy_actions], dim=1)).mean()
-                actor_loss = -q + self.action_l2 * policy_actions.square().mean()
+                actor_critic_in = th.cat([x, policy_actions], dim=1)
+                q = critics[0](actor_critic_in).mean()
+                value = q if auxiliary is None else q + auxiliary.value(actor_critic_in)
+                actor_loss = -value + self.action_l2 * policy_actions.square().mean()
                 self.actor.optimizer.zero_grad()
                 actor_loss.backward()
                 self.actor.optimizer.step()
@@ -343,20 +383,26 @@ class HerDDPG(DDPG):
                 critic_losses.append(critic_loss.detach())
                 actor_losses.append(actor_loss.detach())
                 q_sum = q_sum + q.detach()
+                reward_sum = reward_sum + r.mean()
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/actor_loss", th.stack(actor_losses).mean().item())
         self.logger.record("train/critic_loss", th.stack(critic_losses).mean().item())
         self.logger.record("train/q_mean", q_sum.item() / gradient_steps)
+        self.logger.record("train/reward_mean", reward_sum.item() / gradient_steps)
+        for name, mean in (auxiliary.take_log() if auxiliary else {}).items():
+            self.logger.record(name, mean)
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
             self.logger.record("train/moved_share", self.replay_buffer.moved_share())
+            for name, value in self.replay_buffer.selection_log().items():
+                self.logger.record(name, value)
 
-    def _sample(self, n: int) -> tuple[DictReplayBufferSamples, th.Tensor]:
-        """Draw n transitions and (n, 1) steps until each one's goal was reached, where known."""
+    def _sample(self, n: int, n_batches: int = 1) -> tuple[DictReplayBufferSamples, th.Tensor]:
+        """Draw n transitions for so many batches, and (n, 1) steps until each goal was reached."""
         buffer = self.replay_buffer
         assert buffer is not None
         if isinstance(buffer, FollowObjectReplayBuffer):
-            return buffer.sample_with_steps(n, env=self._vec_normalize_env)
+            return buffer.sample_with_steps(n, self._vec_normalize_env, n_batches)
         data = buffer.sample(n, env=self._vec_normalize_env)
         return data, th.full((n, 1), th.inf, device=self.device)
 
@@ -367,20 +413,14 @@ class HerDDPG(DDPG):
             *self.actor_target.parameters(),
             *self.critic_target.parameters(),
         ]
+        if self.auxiliary_critic is not None:
+            live += self.auxiliary_critic.q_networks.parameters()
+            target += self.auxiliary_critic.target_networks.parameters()
         return live, target
 
 
-@contextmanager
-def _matmul_precision(precision: str) -> Iterator[None]:
-    """Multiply float32 matrices with this precision for a while."""
-    earlier = th.get_float32_matmul_precision()
-    th.set_float32_matmul_precision(precision)
-    try:
-        yield
-    finally:
-        th.set_float32_matmul_precision(earlier)
-
-
-def _lowest(q_values: list[th.Tensor]) -> th.Tensor:
-    """Elementwise minimum over critics (n, 1)."""
-    return q_values[0] if len(q_values) == 1 else th.stack(q_values).amin(dim=0)
+def _is_interval(value: Any) -> bool:
+    """Whether a value is a pair of numbers in order."""
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        return False
+    return all(isinstance(limit, int | float) for limit in value) and value[0] <= value[1]

@@ -13,85 +13,15 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from .cher import GoalSelection
+from .episode_table import EpisodeTable
 from .imagination import imagine
+from .keywords import check_keywords
 from .wrappers import imagination_of
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
 GRAVITY = 9.81  # m/s^2
 IMAGINED_RATIO = "imagined_ratio > 0"  # what needs an environment that imagines goals
-
-
-class EpisodeTable:
-    """The finished episodes of the buffer: where each starts and how long it is.
-
-    Sampling draws from this table, never from the slots, so its cost depends on the number of
-    episodes only through a binary search.
-    """
-
-    _ARRAYS = ("start", "env", "length", "priority")
-
-    def __init__(self) -> None:
-        self.start = np.zeros(64, dtype=np.int64)
-        self.env = np.zeros(64, dtype=np.int64)
-        self.length = np.zeros(64, dtype=np.int64)
-        self.priority = np.zeros(64)  # 0: drawn with all episodes only
-        self._free = list(range(63, -1, -1))
-        self._draw_lists: dict[bool, tuple[np.ndarray, np.ndarray]] = {}
-
-    def insert(self, start: int, env: int, length: int, priority: float) -> int:
-        """Add an episode and return its row."""
-        if not self._free:
-            n = len(self.length)
-            for name in self._ARRAYS:
-                array = getattr(self, name)
-                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
-            self._free = list(range(2 * n - 1, n - 1, -1))
-        row = self._free.pop()
-        self.start[row], self.env[row] = start, env
-        self.length[row], self.priority[row] = length, priority
-        self._draw_lists.clear()
-        return row
-
-    def remove(self, row: int) -> None:
-        """Forget the episode in `row`."""
-        self.length[row] = 0
-        self._free.append(row)
-        self._draw_lists.clear()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next draws depend on."""
-        return {**{name: getattr(self, name) for name in self._ARRAYS}, "free": self._free}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
-        for name in self._ARRAYS:
-            setattr(self, name, state[name].copy())
-        self._free = list(state["free"])
-        self._draw_lists.clear()
-
-    def _draw_list(self, by_priority: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Rows to draw from and the running sum of their weights."""
-        if by_priority not in self._draw_lists:
-            weight = self.length * self.priority if by_priority else self.length
-            rows = np.flatnonzero(weight > 0)
-            self._draw_lists[by_priority] = rows, np.cumsum(weight[rows])
-        return self._draw_lists[by_priority]
-
-    def n_transitions(self, with_priority: bool = False) -> int:
-        """Transitions in finished episodes, or in those with a priority."""
-        return int(self.length[self._draw_list(with_priority)[0]].sum())
-
-    def draw(
-        self, n: int, rng: np.random.Generator, by_priority: bool = False
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw n transitions: rows of the table (n,) and steps within them (n,).
-
-        Uniformly over transitions, or episodes in proportion to length times priority.
-        """
-        rows, ends = self._draw_list(by_priority)
-        which = np.searchsorted(ends, rng.random(n) * ends[-1], side="right")
-        row = rows[np.minimum(which, len(rows) - 1)]
-        return row, rng.integers(self.length[row])
 
 
 class FollowObjectReplayBuffer(HerReplayBuffer):
@@ -118,6 +48,8 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         min_goal_distance: metres; a hindsight goal nearer than this to where the episode's achieved
             goal began was reached before anything was done. Such a transition keeps the goal that
             was shown, so that episodes that moved nothing do not teach to stay. 0 is the paper's.
+        cher: keyword arguments of `GoalSelection`, which then chooses each batch from more
+            candidates; None chooses nothing.
         reward_function: called as f(achieved (n, d), desired (n, d), infos) -> (n,); by default the
             `compute_reward` of the first environment is asked, which costs a round trip between
             processes in a SubprocVecEnv.
@@ -150,6 +82,7 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         moved_priority: str = "uniform",
         step_seconds: float = 0.04,
         min_goal_distance: float = 0.0,
+        cher: dict[str, Any] | None = None,
         reward_function: RewardFunction | None = None,
         seed: int | None = None,
     ):
@@ -184,6 +117,9 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         self.moved_priority = moved_priority
         self.step_seconds = step_seconds
         self.min_goal_distance = min_goal_distance
+        if cher is not None:
+            check_keywords("cher", cher, GoalSelection.__init__)
+        self.selection = None if cher is None else GoalSelection(**cher)
         self.reward_function = reward_function
         if imagined_ratio > 0.0:
             imagination_of(env, IMAGINED_RATIO)  # raises now rather than at the first sample
@@ -268,6 +204,7 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
             "slots": {name: store[:used] for name, store in self._stores().items()},
             "table": self.table.state_dict(),
             "rng": self.rng.bit_generator.state,
+            "selection": None if self.selection is None else self.selection.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -288,6 +225,8 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         self._current_ep_start = state["current_episode_start"].copy()
         self.table.load_state_dict(state["table"])
         self.rng.bit_generator.state = state["rng"]
+        if self.selection is not None:
+            self.selection.load_state_dict(state["selection"])
 
     def _stores(self) -> dict[str, np.ndarray]:
         """Every array with one entry a slot."""
@@ -305,14 +244,19 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         total = self.table.n_transitions()
         return self.table.n_transitions(with_priority=True) / total if total else 0.0
 
+    def selection_log(self) -> dict[str, float]:
+        """Return what there is to log about how batches are chosen."""
+        if self.selection is None:
+            return {}
+        return {"cher/proximity_weight": float(self.selection.proximity_weights(1)[0])}
+
     def sample(  # type: ignore[override]
         self, batch_size: int, env: VecNormalize | None = None
     ) -> DictReplayBufferSamples:
         """Draw transitions and relabel them in one vectorised pass.
 
         Args:
-            batch_size: number of transitions; several gradient steps' worth may be asked for at
-                once and split, since the draws are independent.
+            batch_size: number of transitions.
             env: to normalise observations and rewards, as in SB3.
 
         Raises:
@@ -321,9 +265,14 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         return self.sample_with_steps(batch_size, env)[0]
 
     def sample_with_steps(
-        self, batch_size: int, env: VecNormalize | None = None
+        self, batch_size: int, env: VecNormalize | None = None, n_batches: int = 1
     ) -> tuple[DictReplayBufferSamples, th.Tensor]:
         """Draw as `sample` does, and say how soon the episode itself reached each goal.
+
+        Args:
+            batch_size: number of transitions in all.
+            env: as in `sample`.
+            n_batches: gradient steps that they are for: batch_size / n_batches each, in this order.
 
         Returns:
             The transitions, and (batch_size, 1) float: -1s that the episode was paid from the
@@ -334,6 +283,8 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
                 "the replay buffer holds no finished episode yet; "
                 "set learning_starts to at least one episode of every environment"
             )
+        if self.selection is not None:
+            batch_size *= self.selection.candidates
         row, step = self._draw(batch_size)
         env_idx, start = self.table.env[row], self.table.start[row]
         slot = (start + step) % self.buffer_size
@@ -361,6 +312,13 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
             infos = list(self.infos[slot, env_idx][virtual]) if self.copy_info_dict else []
             rewards[virtual] = self._reward(next_obs["achieved_goal"][virtual], goals, infos)
 
+        if self.selection is not None:
+            chosen = self.selection.choose(
+                obs["desired_goal"], obs["achieved_goal"], n_batches, self.rng
+            )
+            flat, rewards, steps_to_goal = flat[chosen], rewards[chosen], steps_to_goal[chosen]
+            obs = {key: value[chosen] for key, value in obs.items()}
+            next_obs = {key: value[chosen] for key, value in next_obs.items()}
         dones = self._take(self.dones, flat) * (1.0 - self._take(self.timeouts, flat))
         obs = self._normalize_obs(obs, env)  # type: ignore[assignment]
         next_obs = self._normalize_obs(next_obs, env)  # type: ignore[assignment]

@@ -44,7 +44,7 @@ def imagining(**curriculum: Any) -> dict[str, Any]:
 def test_every_task_has_settings_in_every_preset(env_id: str, method: str, preset: str) -> None:
     config = run_config(env_id, method=method, preset=preset, seed=3)
     assert (config.env_id, config.method, config.seed) == (env_id, method, 3)
-    assert config.settings["imagine"] == (method == "fo")
+    assert config.settings["imagine"] == ("fo" in method.split("-"))
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
@@ -85,13 +85,76 @@ def test_her_differs_from_fo_by_its_imagined_goals_alone() -> None:
         assert fo["n_envs"] == her["n_envs"]
 
 
+# What each method's file says besides her.yml's settings (fo.yml's, where goals are imagined).
+OWN = {
+    "shaped": {"hindsight_bound", "target_clip", "reward_type"},
+    "rnd": {"auxiliary"},
+    "cher": {"replay_buffer_kwargs.cher"},
+}
+
+
+def leaves(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Settings by their dotted names; the algorithm's own by their names alone."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        inside = "" if name == "algorithm" else f"{prefix}{name}."
+        found |= leaves(value, inside) if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return found
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("method", OWN)
+@pytest.mark.parametrize("env_id", ROBOTS)
+def test_methods_differ_by_what_makes_them_alone(env_id: str, method: str, preset: str) -> None:
+    base = "fo" if "fo" in method.split("-") else "her"
+    ours = run_config(env_id, method=method, preset=preset)
+    theirs = run_config(env_id, method=base, preset=preset)
+    if (method, preset) == ("cher", "paper"):  # its source's batch
+        assert ours.settings["algorithm"].pop("batch_size") == 64
+        assert theirs.settings["algorithm"].pop("batch_size") == 4864
+    assert ours.total_timesteps == theirs.total_timesteps
+    mine, others = leaves(ours.settings), leaves(theirs.settings)
+    differing = {n for n in {**mine, **others} if mine.get(n) != others.get(n)}
+    own = OWN[method]
+    assert all(any(f"{name}.".startswith(f"{o}.") for o in own) for name in differing)
+    assert differing, "the file is the base method's"
+
+
+def test_distances_fit_between_the_bounds_of_shaped_targets() -> None:
+    for env_id in ROBOTS:
+        for preset in PRESETS:
+            config = run_config(env_id, method="shaped", preset=preset)
+            low, high = config.settings["algorithm"]["target_clip"]
+            assert (low, high) == (-2.0 * IDS[env_id][0].horizon, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "method"),
+    [
+        ({}, "her"),
+        ({"reward_type": "dense"}, "shaped"),
+        ({"auxiliary.name": "rnd", "auxiliary.weight": 0.5}, "rnd"),
+        ({"replay_buffer_kwargs.cher": {}}, "cher"),
+        ({"replay_buffer_kwargs.cher.picks": 9, "auxiliary.name": "rnd"}, "rnd-cher"),
+    ],
+)
+def test_method_is_what_the_settings_make_it(
+    tmp_path: Path, overrides: dict[str, Any], method: str
+) -> None:
+    file = write(tmp_path / "my.yml", {"n_envs": 2})
+    assert run_config(TASK, file=file, overrides=overrides).method == method
+    if overrides:
+        with pytest.raises(ValueError, match=f"with method '{method}' after --set, not 'her'"):
+            run_config(TASK, method="her", overrides=overrides)
+
+
 def test_wrapper_and_callback_become_settings(tmp_path: Path) -> None:
     entry = imagining(p=0.5, levels="path")
     entry |= {"callback": [{CALLBACK: {"every": 3, "n_episodes": 8, "store": False}}]}
     entry |= {"n_timesteps": "1e5", "batch_size": 64, "train_freq": [2, "episode"]}
     entry |= {"env_kwargs": {"reward_type": "dense"}, "n_envs": 4}
     config = run_config(TASK, file=write(tmp_path / "my.yml", entry))
-    assert config.method == "fo"
+    assert config.method == "fo-shaped"
     assert config.total_timesteps == 100_000
     assert config.settings == {
         "imagine": True,
@@ -149,6 +212,9 @@ def test_override_is_read_as_yaml(text: str, expected: tuple[str, Any]) -> None:
         (TASK, {"batch_size": 0}, "batch_size is 0; it must be at least 1"),
         (TASK, {"curriculum": 3}, "curriculum must be a mapping, not 3"),
         (TASK, {"store_tests": 1}, "store_tests must be true or false, not 1"),
+        (TASK, {"auxiliary.nome": "rnd"}, "auxiliary has no setting 'nome'"),
+        (TASK, {"auxiliary": "rnd"}, "auxiliary must be a mapping, not 'rnd'"),
+        (TASK, {"replay_buffer_kwargs.cher.pick": 1}, "cher has no setting 'pick'"),
         (TASK, {"eval_every": 0}, "eval_every is 0; it must be at least 1"),
     ],
 )

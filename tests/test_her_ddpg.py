@@ -220,6 +220,8 @@ def test_environment_without_goals_is_refused() -> None:
         ({"matmul_precision": "low"}, "matmul_precision is 'low'"),
         ({"policy_kwargs": {"features_extractor_class": object}}, "leave features_extractor"),
         ({"target_clip": "wide"}, "target_clip is 'wide'"),
+        ({"target_clip": [0.0, -1.0]}, "give .low, high."),
+        ({"target_clip": [0.0]}, "give .low, high."),
     ],
 )
 def test_bad_arguments(arguments: dict[str, Any], sentence: str) -> None:

@@ -1,0 +1,24 @@
+"""Small helpers around PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch as th
+
+
+@contextmanager
+def matmul_at(precision: str) -> Iterator[None]:
+    """Multiply float32 matrices with this precision for a while."""
+    earlier = th.get_float32_matmul_precision()
+    th.set_float32_matmul_precision(precision)
+    try:
+        yield
+    finally:
+        th.set_float32_matmul_precision(earlier)
+
+
+def lowest(q_values: list[th.Tensor]) -> th.Tensor:
+    """Elementwise minimum over critics (n, 1)."""
+    return q_values[0] if len(q_values) == 1 else th.stack(q_values).amin(dim=0)
