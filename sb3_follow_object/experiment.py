@@ -33,6 +33,7 @@ from .rollout import Episodes, run_episodes
 
 CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
 CHECKPOINT, PREDICTOR = "checkpoint.safetensors", "predictor"
+OBJECT_STAGE, VERSIONS = "object_stage.json", "versions.json"
 POLICY, LAST_POLICY = "policy.safetensors", "last_policy.safetensors"
 PACKAGES = ["sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics"]
 PACKAGES += ["mujoco", "torch", "numpy"]
@@ -114,6 +115,10 @@ class RunCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
+        assert self.run.model is not None
+        if not all(bool(th.isfinite(w).all()) for w in self.run.model.actor.parameters()):
+            steps = f"{self.run.env_steps:,}"
+            raise RuntimeError(f"diverged: the policy is not finite after {steps} env steps")
         n_validated = self.evaluation.n_evaluations
         if n_validated > self._n_validated:
             self._n_validated = n_validated
@@ -201,10 +206,10 @@ def train(
         saved = load_tree(folder / CHECKPOINT)
     _check_algorithms(run)
     if not resume:
-        _claim(folder, config)
+        claim(folder, config)
     elif saved is None:  # stopped before the first checkpoint: what was evaluated begins anew
         (folder / EVALUATIONS).unlink(missing_ok=True)
-    stage_file = folder / "object_stage.json"
+    stage_file = folder / OBJECT_STAGE
     if predictor is not None and stage_file.exists():
         stage = json.loads(stage_file.read_text())
         run.object_steps, run.object_success = stage["object_steps"], stage["object_success"]
@@ -212,10 +217,7 @@ def train(
     started = time.monotonic()
     model = run.prepare()
     if run.predictor is not None and predictor is None:
-        run.predictor.save(folder / PREDICTOR)
-        stage = {"object_steps": run.object_steps, "object_success": run.object_success}
-        stage["wall_s"] = round(time.monotonic() - started, 1)
-        atomic_write(stage_file, json.dumps(stage).encode())
+        save_object_stage(run, folder, time.monotonic() - started)
     wall_before = json.loads(stage_file.read_text())["wall_s"] if stage_file.exists() else 0.0
 
     eval_env = evaluation_env(config.env_id, stream_seed(config.seed, "validation"), run.settings)
@@ -259,6 +261,18 @@ def train(
     eval_env.close()
     run.close()
     return result
+
+
+def save_object_stage(run: FollowObject, folder: Path, wall_s: float) -> None:
+    """Keep what the first two stages made and cost; a run in the folder then skips them.
+
+    The cost comes last: where it is told, everything else is there.
+    """
+    assert run.predictor is not None
+    run.predictor.save(folder / PREDICTOR)
+    stage = {"object_steps": run.object_steps, "object_success": run.object_success}
+    stage["wall_s"] = round(wall_s, 1)
+    atomic_write(folder / OBJECT_STAGE, json.dumps(stage).encode())
 
 
 def evaluation_env(env_id: str, seed: int, settings: dict[str, Any] | None = None) -> VecEnv:
@@ -319,14 +333,22 @@ def _check_folder(folder: Path, config: RunConfig, resume: bool) -> None:
         return
     if not (folder / CONFIG).exists():
         raise ValueError(f"{folder} holds no run to resume")
-    kept = _flat(json.loads((folder / CONFIG).read_text()))
-    wanted = _flat(json.loads(json.dumps(asdict(config))))
-    for name in {**kept, **wanted}:
-        if kept.get(name) != wanted.get(name):
-            raise ValueError(
-                f"the run in {folder} has {name} {kept.get(name)!r}, not {wanted.get(name)!r}; "
-                "resume it as it is or start another in another folder"
-            )
+    different = difference(json.loads((folder / CONFIG).read_text()), asdict(config))
+    if different is not None:
+        name, kept, wanted = different
+        raise ValueError(
+            f"the run in {folder} has {name} {kept!r}, not {wanted!r}; "
+            "resume it as it is or start another in another folder"
+        )
+
+
+def difference(kept: dict[str, Any], wanted: dict[str, Any]) -> tuple[str, Any, Any] | None:
+    """Return the first setting that differs, by its dotted name, and its two values."""
+    ours, theirs = _flat(kept), _flat(json.loads(json.dumps(wanted)))
+    for name in {**ours, **theirs}:
+        if ours.get(name) != theirs.get(name):
+            return name, ours.get(name), theirs.get(name)
+    return None
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -357,12 +379,12 @@ def _check_algorithms(run: FollowObject) -> None:
         object_env.close()
 
 
-def _claim(folder: Path, config: RunConfig) -> None:
-    """Create the folder with its config and versions."""
+def claim(folder: Path, config: RunConfig) -> None:
+    """Create a run's folder with its config and versions: what `train(resume=True)` asks for."""
     folder.mkdir(parents=True, exist_ok=True)
     versions: dict[str, str | None] = {n: importlib.metadata.version(n) for n in PACKAGES}
     versions |= {"python": platform.python_version(), "commit": source_commit()}
-    atomic_write(folder / "versions.json", json.dumps(versions, indent=2).encode())
+    atomic_write(folder / VERSIONS, json.dumps(versions, indent=2).encode())
     atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
 
 
