@@ -12,9 +12,9 @@ from typing import Any
 
 from .cross import partner, read_cross_tests
 from .executors import Executor, Message
-from .experiment import OBJECT_STAGE, POLICY, trained_steps
+from .experiment import POLICY, trained_steps
 from .extras import MissingExtra
-from .grid import ATTEMPTS, OBJECT, Cell, Ledger, Settings, prepare, shared_stage
+from .grid import ATTEMPTS, OBJECT, Cell, Ledger, Settings, prepare, shared_stage, stage_is_ready
 from .grid_display import GridDisplay
 from .worker import CROSS, STAGE, TRAIN, Job
 
@@ -150,7 +150,7 @@ class Comparison:
         if self._failed(cell) or cell.name in self._jobs:
             return None
         stage = shared_stage(cell)
-        if stage is not None and not (stage / OBJECT_STAGE).exists():
+        if stage is not None and not stage_is_ready(stage):
             name = f"{OBJECT}/{stage.name}"
             if self._failures.get(name, 0) >= ATTEMPTS:
                 error = f"its object stage failed (see {name})"

@@ -33,7 +33,7 @@ from .rollout import Episodes, run_episodes
 
 CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
 CHECKPOINT, PREDICTOR = "checkpoint.safetensors", "predictor"
-OBJECT_STAGE, VERSIONS = "object_stage.json", "versions.json"
+OBJECT_STAGE = "object_stage.json"
 POLICY, LAST_POLICY = "policy.safetensors", "last_policy.safetensors"
 PACKAGES = ["sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics"]
 PACKAGES += ["mujoco", "torch", "numpy"]
@@ -170,6 +170,7 @@ def train(
     report: Report = print,
     progress: Callable[[dict[str, Any]], None] = lambda figures: None,
     command: str = "",
+    object_stage_only: bool = False,
 ) -> dict[str, Any]:
     """Train in a folder and return its result, also written to result.json.
 
@@ -183,6 +184,7 @@ def train(
         report: called with a sentence now and then.
         progress: called with env_steps, k_max and success_rate after each rollout.
         command: the command line to note in the result.
+        object_stage_only: end where the robot's training would begin, and return nothing.
 
     Raises:
         ValueError: the folder holds another run, or none where one should be resumed.
@@ -217,7 +219,13 @@ def train(
     started = time.monotonic()
     model = run.prepare()
     if run.predictor is not None and predictor is None:
-        save_object_stage(run, folder, time.monotonic() - started)
+        run.predictor.save(folder / PREDICTOR)
+        stage = {"object_steps": run.object_steps, "object_success": run.object_success}
+        stage["wall_s"] = round(time.monotonic() - started, 1)
+        atomic_write(stage_file, json.dumps(stage).encode())
+    if object_stage_only:
+        run.close()
+        return {}
     wall_before = json.loads(stage_file.read_text())["wall_s"] if stage_file.exists() else 0.0
 
     eval_env = evaluation_env(config.env_id, stream_seed(config.seed, "validation"), run.settings)
@@ -261,18 +269,6 @@ def train(
     eval_env.close()
     run.close()
     return result
-
-
-def save_object_stage(run: FollowObject, folder: Path, wall_s: float) -> None:
-    """Keep what the first two stages made and cost; a run in the folder then skips them.
-
-    The cost comes last: where it is told, everything else is there.
-    """
-    assert run.predictor is not None
-    run.predictor.save(folder / PREDICTOR)
-    stage = {"object_steps": run.object_steps, "object_success": run.object_success}
-    stage["wall_s"] = round(wall_s, 1)
-    atomic_write(folder / OBJECT_STAGE, json.dumps(stage).encode())
 
 
 def evaluation_env(env_id: str, seed: int, settings: dict[str, Any] | None = None) -> VecEnv:
@@ -384,7 +380,7 @@ def claim(folder: Path, config: RunConfig) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     versions: dict[str, str | None] = {n: importlib.metadata.version(n) for n in PACKAGES}
     versions |= {"python": platform.python_version(), "commit": source_commit()}
-    atomic_write(folder / VERSIONS, json.dumps(versions, indent=2).encode())
+    atomic_write(folder / "versions.json", json.dumps(versions, indent=2).encode())
     atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
 
 

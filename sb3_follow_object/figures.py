@@ -134,7 +134,8 @@ def _cross_panel(axis: Any, groups: Sequence[Group]) -> None:
         axis.bar(place, middle, width=0.8, yerr=error, capsize=3, color=f"C{PAIR.index(trained)}")
         axis.text(place, middle + 0.02, f"{middle:.2f}", ha="center")
     axis.set_xticks(range(len(labels)), labels, fontsize=7)
-    axis.set(title="HER-a and HER-b", ylabel="final success", ylim=(0.0, 1.1))
+    axis.set_title("HER-a and HER-b", pad=16)
+    axis.set(ylabel="final success", ylim=(0.0, 1.1))
 
 
 def _cross_values(group: Group, tested: str) -> np.ndarray:
@@ -151,12 +152,13 @@ def _curve_panel(
     """Draw all methods' curves on a task: median and quartiles; single runs while unfinished."""
     ticker = need("matplotlib.ticker", "plots")
     label, unit = X_AXES[x]
-    notes = []
+    notes: dict[str, list[str]] = {}  # methods by what is missing
     for group in (group for group in groups if group.task == task):
         color = _color(methods, group.method)
-        if group.missing:
-            notes.append(f"{group.method}: {group.missing}")
         finished = _read_curves(group, FINISHED)
+        missing = group.missing or ("" if finished else "no validations")
+        if missing:
+            notes.setdefault(missing, []).append(group.method)
         if finished:
             points, (low, middle, high) = spread(finished, x, "success_rate")
             axis.plot(points / unit, middle, color=color, marker="." if len(points) < 3 else "")
@@ -165,27 +167,18 @@ def _curve_panel(
         for curve in _read_curves(group, UNFINISHED):
             xs = curve.columns[x] / unit
             axis.plot(xs, curve.columns["success_rate"], color=color, linestyle=":", marker=".")
-    axis.set(title=task, xlabel=label, ylabel="success on original goals", ylim=(-0.02, 1.02))
-    if not axis.lines:
-        axis.add_patch(
-            need("matplotlib.patches", "plots").Rectangle(
-                (0, 0), 1, 1, transform=axis.transAxes, **_HATCH
-            )
-        )
-    axis.set_xlim(0, None)
-    axis.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
+    axis.set(xlabel=label, ylabel="success on original goals", ylim=(-0.02, 1.02))
+    axis.set_title(task, pad=16)
+    note = "; ".join(f"{what}: {', '.join(names)}" for what, names in notes.items())
+    axis.text(0.5, 1.02, note, transform=axis.transAxes, ha="center", fontsize=7)
     axis.grid(alpha=0.3)
-    box = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none"}
-    axis.text(
-        0.98,
-        0.5,
-        "\n".join(notes),
-        transform=axis.transAxes,
-        ha="right",
-        va="center",
-        fontsize=7,
-        bbox=box if notes else None,
-    )
+    if axis.lines:
+        axis.set_xlim(0, None)
+        axis.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
+    else:
+        patches = need("matplotlib.patches", "plots")
+        axis.add_patch(patches.Rectangle((0, 0), 1, 1, transform=axis.transAxes, **_HATCH))
+        axis.set_xticks([])
 
 
 def _read_curves(group: Group, status: str) -> list[Curve]:

@@ -17,16 +17,16 @@ from .config import METHODS, check_task, load_config, run_config
 from .envs import IDS, TASKS
 from .envs.tasks import did_you_mean
 from .experiment import (
-    CHECKPOINT,
     CONFIG,
     OBJECT_STAGE,
+    PREDICTOR,
     RESULT,
-    VERSIONS,
     RunConfig,
     claim,
     difference,
 )
 from .files import atomic_write
+from .goal_predictor import FACTS_FILE
 
 GRID, OBJECT, LOGS = "grid.json", "object", "logs"
 FINISHED, FAILED, UNFINISHED, NOT_RUN = "finished", "failed", "unfinished", "not run"
@@ -97,7 +97,7 @@ class Cell:
     @property
     def stage(self) -> Path | None:
         """Folder of the object stage that the run shares; None where it needs none."""
-        if not self.config.settings.get("imagine", True):
+        if not needs_object_stage(self.config):
             return None
         return self.folder.parent / OBJECT / f"{_file_name(self.task)}-{self.seed}"
 
@@ -148,29 +148,41 @@ def task_name(env_id: str) -> str:
     return name if name in TASKS else env_id
 
 
+def needs_object_stage(config: RunConfig) -> bool:
+    """Whether a run begins with what its object learns alone."""
+    return bool(config.settings.get("imagine", True))
+
+
 def stage_settings(config: RunConfig) -> dict[str, Any]:
     """Return the settings that decide what a run's object stage comes to."""
     return {
         name: value
         for name, value in config.settings.items()
-        if name.startswith("object_") or name in ("n_paths", "predictor_fit")
+        if name.startswith("object_") or name.endswith("_fit") or name == "n_paths"
     }
 
 
 def shared_stage(cell: Cell) -> Path | None:
-    """Make the folder of the object stage that the cell's run still needs, and return it.
+    """Make the folder of the object stage that the cell's run will share, and return it.
 
     Returns:
-        None where the run needs none or has one, and where the one of its task and seed is
-        another's, with other settings: the run then makes its own.
+        None where the run needs none or has begun already, and where the one of its task and seed
+        is another's, with other settings: the run then makes its own.
     """
     stage = cell.stage
-    if stage is None or any((cell.folder / name).exists() for name in (OBJECT_STAGE, CHECKPOINT)):
+    if stage is None or (cell.folder / CONFIG).exists():
         return None
     if not (stage / CONFIG).exists():
-        claim(stage, cell.config)
+        # A whole one, with F_phi, serves the runs that do not imagine goals as well.
+        settings = {**cell.config.settings, "imagine": True}
+        _claim_whole(stage, replace(cell.config, settings=settings))
     same = stage_settings(load_config(stage)) == stage_settings(cell.config)
     return stage if same else None
+
+
+def stage_is_ready(stage: Path) -> bool:
+    """Whether an object stage has ended: both files are written last, in either order."""
+    return (stage / OBJECT_STAGE).exists() and (stage / PREDICTOR / FACTS_FILE).exists()
 
 
 def prepare(cell: Cell, stage: Path | None) -> None:
@@ -179,21 +191,23 @@ def prepare(cell: Cell, stage: Path | None) -> None:
     The stage's env steps are told with it, so each run that uses it counts them.
     """
     if not (cell.folder / CONFIG).exists():
-        # The folder appears as a whole: one without a configuration could not be resumed.
-        new = cell.folder.with_name(f".{cell.name}.new")
-        shutil.rmtree(new, ignore_errors=True)
-        claim(new, cell.config)
-        if cell.folder.is_dir() and not any(cell.folder.iterdir()):
-            cell.folder.rmdir()
-        os.replace(new, cell.folder)
-    if stage is None:
-        return
-    for path in stage.iterdir():
+        _claim_whole(cell.folder, cell.config, stage)
+
+
+def _claim_whole(folder: Path, config: RunConfig, stage: Path | None = None) -> None:
+    """Make a run's folder appear as a whole: a part of one could not be resumed."""
+    new = folder.with_name(f".{folder.name}.new")
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir(parents=True)
+    if folder.is_dir():
+        folder.rmdir()  # an empty one, as `plan` has seen
+    claim(new, config)
+    for path in stage.iterdir() if stage else ():
         if path.is_dir():
-            shutil.copytree(path, cell.folder / path.name, dirs_exist_ok=True)
-        elif path.name not in (CONFIG, VERSIONS, OBJECT_STAGE) and not path.name.startswith("."):
-            shutil.copyfile(path, cell.folder / path.name)
-    atomic_write(cell.folder / OBJECT_STAGE, (stage / OBJECT_STAGE).read_bytes())
+            shutil.copytree(path, new / path.name)
+        elif not (new / path.name).exists() and not path.name.startswith((".", "checkpoint")):
+            shutil.copyfile(path, new / path.name)
+    os.replace(new, folder)
 
 
 class Ledger:

@@ -10,7 +10,6 @@ import json
 import os
 import signal
 import sys
-import time
 import traceback
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -60,51 +59,27 @@ def run_job(job: Job, send: Send) -> None:
         KeyboardInterrupt: it was stopped; a run has written its checkpoint.
     """
     from .config import load_config
+    from .cross import cross_test
     from .experiment import train
 
     folder = Path(job.folder)
-    config = load_config(folder)
 
     def say(sentence: str) -> None:
         print(sentence, file=sys.stderr, flush=True)
         send({"say": sentence.strip()})
 
-    if job.kind == STAGE:
-        _learn_stage(folder, say)
-    elif job.kind == TRAIN:
-        train(
-            config,
-            folder,
-            resume=True,
-            report=say,
-            progress=lambda figures: send({"figures": figures}),
-            command=job.command,
-        )
-    else:
-        from .cross import cross_test
-
+    if job.kind == CROSS:
         cross_test(folder, job.other)
-
-
-def _learn_stage(folder: Path, say: Callable[[str], None]) -> None:
-    """Run the first two stages of the folder's configuration there."""
-    import torch as th
-
-    from .config import load_config
-    from .experiment import save_object_stage
-    from .follow_object import FollowObject
-
-    config = load_config(folder)
-    th.set_num_threads(config.torch_threads)
-    started = time.monotonic()
-    # The robot's copies are not stepped here.
-    settings = {**config.settings, "n_envs": 1}
-    run = FollowObject(config.env_id, seed=config.seed, report=say, **settings)
-    try:
-        run.learn_predictor()
-        save_object_stage(run, folder, time.monotonic() - started)
-    finally:
-        run.close()
+        return
+    train(
+        load_config(folder),
+        folder,
+        resume=True,
+        report=say,
+        progress=lambda figures: send({"figures": figures}),
+        command=job.command,
+        object_stage_only=job.kind == STAGE,
+    )
 
 
 def one_line(error: BaseException) -> str:
