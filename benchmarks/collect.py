@@ -5,7 +5,8 @@
 A row of summary.csv is replaced by a run of the same task, method and seed. Each run's policy,
 predictor, configuration, versions and learning curve are copied beside it, so that
 `sb3-follow-object evaluate benchmarks/results/<run>` tests it again. README's table is drawn from
-summary.csv: medians over seeds.
+summary.csv: medians over seeds. Its figure, the paper's figures and the tables of final success are
+drawn from the copied runs.
 """
 
 from __future__ import annotations
@@ -17,6 +18,10 @@ import shutil
 from itertools import groupby
 from pathlib import Path
 from statistics import median
+
+from sb3_follow_object.cross import CROSS_TESTS
+from sb3_follow_object.figures import FINAL_SUCCESS, draw_results
+from sb3_follow_object.results import read_results, write_tables
 
 RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parents[1] / "README.md"
@@ -33,6 +38,10 @@ COLUMNS = (
     "episodes",
     "command",
     "commit",
+)
+FIGURE = (
+    "\n![Final success of every method on every task; hatched where there is none]"
+    f"(benchmarks/results/figures/{FINAL_SUCCESS})\n"
 )
 KEPT = ("config.json", "result.json", "versions.json", "evaluations.csv", "policy.safetensors")
 
@@ -52,6 +61,8 @@ def keep_files(run: Path, row: dict[str, str]) -> None:
     target.mkdir(parents=True, exist_ok=True)
     for name in KEPT:
         shutil.copyfile(run / name, target / name)
+    if (run / CROSS_TESTS).exists():
+        shutil.copyfile(run / CROSS_TESTS, target / CROSS_TESTS)
     if (run / "predictor").exists():
         shutil.copytree(run / "predictor", target / "predictor", dirs_exist_ok=True)
 
@@ -96,9 +107,11 @@ def main() -> None:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(ordered := [rows[key] for key in sorted(rows)])
+    write_tables(read_results(RESULTS), RESULTS)
+    draw_results(RESULTS, RESULTS / "figures")
     text = README.read_text()
     head, rest = text.split(BEGIN)
-    README.write_text(head + BEGIN + table(ordered) + END + rest.split(END)[1])
+    README.write_text(head + BEGIN + table(ordered) + FIGURE + END + rest.split(END)[1])
     print(f"{len(rows)} rows in {summary}")
 
 

@@ -1,4 +1,4 @@
-"""The command `sb3-follow-object`: train, evaluate, watch, plot, predictor."""
+"""The command `sb3-follow-object`: train, evaluate, watch, plot, compare, predictor."""
 
 from __future__ import annotations
 
@@ -47,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         hint = "interrupted"
         if args.run_command is _train and args.run.exists():
             hint += f"; go on with: {PROGRAM} train --resume --run {shlex.quote(str(args.run))}"
+        if args.run_command is _compare:
+            hint += "; the same command goes on where it stopped"
         print(f"{PROGRAM}: {hint}", file=sys.stderr)
         return INTERRUPTED
     return 0
@@ -78,6 +80,9 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("run", type=Path, help="folder with policy.safetensors and config.json")
     evaluate.add_argument("--episodes", type=int, default=380, metavar="N", help="default: 380")
     evaluate.add_argument("--seed", type=int, metavar="N", help="of the episodes; default: run's")
+    evaluate.add_argument(
+        "--env", metavar="ID", help="another task; the figure is kept in RUN for plot --results"
+    )
     evaluate.add_argument("--json", action="store_true", help="print one JSON object")
 
     watch = commands.add_parser("watch", help="film a run's policy")
@@ -89,16 +94,53 @@ def _parser() -> argparse.ArgumentParser:
 
     plot = commands.add_parser("plot", help="draw success and k_max of one or several runs")
     plot.set_defaults(run_command=_plot)
-    plot.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run folders")
+    plot.add_argument("runs", type=Path, nargs="*", metavar="RUN", help="run folders")
     plot.add_argument(
-        "--out", type=Path, metavar="FILE.png", help=f"default: RUN/{CURVE}, or of several {CURVE}"
+        "--results", type=Path, metavar="FOLDER", help="draw the paper's figures of all runs in it"
     )
+    plot.add_argument(
+        "--out",
+        type=Path,
+        metavar="PATH",
+        help=f"PNG, default: RUN/{CURVE}, or of several {CURVE}; of --results a folder",
+    )
+
+    _add_compare(commands)
 
     predictor = commands.add_parser("predictor", help="learn F_phi alone, stages one and two")
     predictor.set_defaults(run_command=_predictor, method="fo")
     predictor.add_argument("--out", type=Path, required=True, metavar="FOLDER")
     _add_settings(predictor)
     return parser
+
+
+def _add_compare(commands: Any) -> None:
+    """Add the command that runs a grid."""
+    compare = commands.add_parser("compare", help="run a grid of tasks, methods and seeds")
+    compare.set_defaults(run_command=_compare)
+    compare.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="of the results")
+    compare.add_argument("--tasks", nargs="+", required=True, metavar="TASK", help="e.g. PnPShelf")
+    compare.add_argument(
+        "--methods", nargs="+", required=True, metavar="METHOD", help="e.g. fo her"
+    )
+    compare.add_argument(
+        "--seeds", nargs="+", type=int, default=[0], metavar="N", help="default: 0"
+    )
+    compare.add_argument("--steps", type=int, metavar="N", help="env steps of each run")
+    compare.add_argument("--preset", choices=("default", "paper"), default="default")
+    _add_set(compare)
+    compare.add_argument(
+        "--paper-evaluation",
+        action="store_true",
+        help="validate on 380 episodes after each of the paper's epochs of 1,900 episodes",
+    )
+    compare.add_argument("--jobs", type=int, metavar="N", help="runs at once; default: as fit")
+    compare.add_argument("--threads", type=int, metavar="N", help="cores of each run")
+    compare.add_argument("--ray", metavar="ADDRESS", help="of a Ray cluster, or local")
+    compare.add_argument(
+        "--retry-failed", action="store_true", help="try runs again that were given up"
+    )
+    compare.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
@@ -108,6 +150,10 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--preset", choices=("default", "paper"), help="settings of the package")
     source.add_argument("--config", type=Path, metavar="FILE.yml", help="settings of your own")
+    _add_set(parser)
+
+
+def _add_set(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set",
         action="extend",
@@ -211,17 +257,22 @@ def _resumed_config(args: argparse.Namespace) -> RunConfig:
 
 def _evaluate(args: argparse.Namespace) -> None:
     from .config import load_config
+    from .cross import cross_test
     from .experiment import POLICY, evaluate, trained_steps
 
     config = load_config(args.run)
+    env_id = args.env or config.env_id
     seed = config.seed if args.seed is None else args.seed
-    episodes = evaluate(args.run / POLICY, config.env_id, args.episodes, seed)
+    if env_id == config.env_id:
+        rate = evaluate(args.run / POLICY, env_id, args.episodes, seed).success_rate
+    else:
+        rate = cross_test(args.run, env_id, args.episodes, seed)
     result = {
-        "env": config.env_id,
+        "env": env_id,
         "method": config.method,
         "seed": config.seed,
         "episodes": args.episodes,
-        "success_rate": episodes.success_rate,
+        "success_rate": rate,
         "env_steps": trained_steps(args.run),
     }
     if args.json:
@@ -242,11 +293,52 @@ def _watch(args: argparse.Namespace) -> None:
 
 
 def _plot(args: argparse.Namespace) -> None:
+    from .figures import draw_results
     from .plots import draw_curves
 
+    if bool(args.runs) == bool(args.results):
+        raise ValueError("give either run folders or --results FOLDER, a folder of run folders")
+    if args.results:
+        for path in draw_results(args.results, args.out or args.results / "figures"):
+            print(path)
+        return
     out = args.out or (args.runs[0] / CURVE if len(args.runs) == 1 else Path(CURVE))
     draw_curves(args.runs, out)
     print(out)
+
+
+def _compare(args: argparse.Namespace) -> None:
+    from .compare import Comparison, cores, share_cores, write_report
+    from .config import parse_override
+    from .executors import Executor, LocalExecutor
+    from .grid import LOGS, Settings, plan
+    from .grid_display import GridDisplay
+
+    overrides = dict(parse_override(text) for text in args.set)
+    settings = Settings(args.steps, args.preset, overrides, args.paper_evaluation)
+    grid = (args.out, args.tasks, args.methods, args.seeds, settings)
+    n_runs = len(plan(*grid))  # what cannot be meant is refused before a cluster is asked for
+    executor: Executor
+    if args.ray is None:
+        jobs, threads = share_cores(cores(), n_runs, args.jobs, args.threads)
+        executor = LocalExecutor(jobs, args.out / LOGS)
+    else:
+        from .ray_executor import RayExecutor, connect
+
+        jobs, threads = share_cores(connect(args.ray), n_runs, args.jobs, args.threads or 1)
+        executor = RayExecutor(jobs)
+    with GridDisplay(quiet=args.quiet) as display:
+        comparison = Comparison(
+            args.out, plan(*grid, threads), settings, executor, threads, display, args.retry_failed
+        )
+        try:
+            failed = comparison.run()
+        finally:
+            write_report(args.out, display.say)
+    if not args.quiet:
+        print((args.out / "table.md").read_text(), end="")
+    if failed:
+        raise RuntimeError(f"{len(failed)} of {n_runs} runs failed: {', '.join(failed)}")
 
 
 def _predictor(args: argparse.Namespace) -> None:

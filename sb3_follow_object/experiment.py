@@ -33,6 +33,7 @@ from .rollout import Episodes, run_episodes
 
 CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
 CHECKPOINT, PREDICTOR = "checkpoint.safetensors", "predictor"
+OBJECT_STAGE = "object_stage.json"
 POLICY, LAST_POLICY = "policy.safetensors", "last_policy.safetensors"
 PACKAGES = ["sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics"]
 PACKAGES += ["mujoco", "torch", "numpy"]
@@ -114,6 +115,10 @@ class RunCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
+        assert self.run.model is not None
+        if not all(bool(th.isfinite(w).all()) for w in self.run.model.actor.parameters()):
+            steps = f"{self.run.env_steps:,}"
+            raise RuntimeError(f"diverged: the policy is not finite after {steps} env steps")
         n_validated = self.evaluation.n_evaluations
         if n_validated > self._n_validated:
             self._n_validated = n_validated
@@ -165,6 +170,7 @@ def train(
     report: Report = print,
     progress: Callable[[dict[str, Any]], None] = lambda figures: None,
     command: str = "",
+    object_stage_only: bool = False,
 ) -> dict[str, Any]:
     """Train in a folder and return its result, also written to result.json.
 
@@ -178,6 +184,7 @@ def train(
         report: called with a sentence now and then.
         progress: called with env_steps, k_max and success_rate after each rollout.
         command: the command line to note in the result.
+        object_stage_only: end where the robot's training would begin, and return nothing.
 
     Raises:
         ValueError: the folder holds another run, or none where one should be resumed.
@@ -201,10 +208,10 @@ def train(
         saved = load_tree(folder / CHECKPOINT)
     _check_algorithms(run)
     if not resume:
-        _claim(folder, config)
+        claim(folder, config)
     elif saved is None:  # stopped before the first checkpoint: what was evaluated begins anew
         (folder / EVALUATIONS).unlink(missing_ok=True)
-    stage_file = folder / "object_stage.json"
+    stage_file = folder / OBJECT_STAGE
     if predictor is not None and stage_file.exists():
         stage = json.loads(stage_file.read_text())
         run.object_steps, run.object_success = stage["object_steps"], stage["object_success"]
@@ -216,6 +223,9 @@ def train(
         stage = {"object_steps": run.object_steps, "object_success": run.object_success}
         stage["wall_s"] = round(time.monotonic() - started, 1)
         atomic_write(stage_file, json.dumps(stage).encode())
+    if object_stage_only:
+        run.close()
+        return {}
     wall_before = json.loads(stage_file.read_text())["wall_s"] if stage_file.exists() else 0.0
 
     eval_env = evaluation_env(config.env_id, stream_seed(config.seed, "validation"), run.settings)
@@ -319,14 +329,22 @@ def _check_folder(folder: Path, config: RunConfig, resume: bool) -> None:
         return
     if not (folder / CONFIG).exists():
         raise ValueError(f"{folder} holds no run to resume")
-    kept = _flat(json.loads((folder / CONFIG).read_text()))
-    wanted = _flat(json.loads(json.dumps(asdict(config))))
-    for name in {**kept, **wanted}:
-        if kept.get(name) != wanted.get(name):
-            raise ValueError(
-                f"the run in {folder} has {name} {kept.get(name)!r}, not {wanted.get(name)!r}; "
-                "resume it as it is or start another in another folder"
-            )
+    different = difference(json.loads((folder / CONFIG).read_text()), asdict(config))
+    if different is not None:
+        name, kept, wanted = different
+        raise ValueError(
+            f"the run in {folder} has {name} {kept!r}, not {wanted!r}; "
+            "resume it as it is or start another in another folder"
+        )
+
+
+def difference(kept: dict[str, Any], wanted: dict[str, Any]) -> tuple[str, Any, Any] | None:
+    """Return the first setting that differs, by its dotted name, and its two values."""
+    ours, theirs = _flat(kept), _flat(json.loads(json.dumps(wanted)))
+    for name in {**ours, **theirs}:
+        if ours.get(name) != theirs.get(name):
+            return name, ours.get(name), theirs.get(name)
+    return None
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -357,8 +375,8 @@ def _check_algorithms(run: FollowObject) -> None:
         object_env.close()
 
 
-def _claim(folder: Path, config: RunConfig) -> None:
-    """Create the folder with its config and versions."""
+def claim(folder: Path, config: RunConfig) -> None:
+    """Create a run's folder with its config and versions: what `train(resume=True)` asks for."""
     folder.mkdir(parents=True, exist_ok=True)
     versions: dict[str, str | None] = {n: importlib.metadata.version(n) for n in PACKAGES}
     versions |= {"python": platform.python_version(), "commit": source_commit()}

@@ -17,7 +17,7 @@ from .experiment import EVALUATIONS
 from .extras import need
 from .files import atomic_write
 
-_X = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time (minutes)", 60.0)}
+X_AXES = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time (minutes)", 60.0)}
 _Y = {"success_rate": "success on original goals", "k_max": "k_max"}
 
 
@@ -51,7 +51,7 @@ def read_curve(folder: str | os.PathLike[str]) -> Curve:
             rows = list(csv.DictReader(file))
     if not rows:
         raise ValueError(f"the run in {folder} has not been validated yet: nothing to plot")
-    names = [*_X, *(name for name in _Y if rows[0].get(name))]
+    names = [*X_AXES, *(name for name in _Y if rows[0].get(name))]
     try:
         columns = {name: np.array([float(row[name]) for row in rows]) for name in names}
     except (KeyError, TypeError, ValueError) as error:
@@ -100,13 +100,13 @@ def draw_curves(folders: Sequence[str | os.PathLike[str]], out: str | os.PathLik
         y for y in _Y if any(y in curve.columns for group in groups.values() for curve in group)
     ]
     figure = figure_module.Figure(figsize=(10, 3.2 * len(shown)), layout="constrained")
-    axes = figure.subplots(len(shown), len(_X), squeeze=False)
+    axes = figure.subplots(len(shown), len(X_AXES), squeeze=False)
     for (task, method), group in sorted(groups.items()):
         label = method if len(tasks) == 1 else f"{task} {method}"
         label += f" ({len(group)} runs)" if len(group) > 1 else ""
         _draw_group(axes, shown, group, label)
     for row, y in zip(axes, shown, strict=True):
-        for axis, (name, _) in zip(row, _X.values(), strict=True):
+        for axis, (name, _) in zip(row, X_AXES.values(), strict=True):
             axis.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
             axis.set(xlabel=name, ylabel=_Y[y], xlim=(0, None), ylim=(0, None))
             if y == "success_rate":
@@ -127,7 +127,7 @@ def _draw_group(axes: Any, shown: Sequence[str], group: Sequence[Curve], label: 
             for axis in row:
                 axis.plot([], [])  # keeps the colours the same in every panel
             continue
-        for axis, (x, (_, unit)) in zip(row, _X.items(), strict=True):
+        for axis, (x, (_, unit)) in zip(row, X_AXES.items(), strict=True):
             points, (low, middle, high) = spread(group, x, y)
             (line,) = axis.plot(points / unit, middle, label=label)
             if len(group) > 1:

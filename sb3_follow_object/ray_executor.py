@@ -1,0 +1,171 @@
+"""Where a comparison's jobs run: on the nodes of a Ray cluster, which need not share a disk."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from .executors import Message
+from .experiment import OBJECT_STAGE, RESULT
+from .extras import need
+from .files import atomic_write
+from .worker import Job, one_line, run_job
+
+LOCAL = "local"
+
+_POST_EVERY = 1.0  # seconds between two reports of figures: a rollout may take less
+
+
+def connect(address: str) -> int:
+    """Connect to a Ray cluster and return how many cores it has.
+
+    Args:
+        address: of the cluster, e.g. 10.0.0.1:6379 or auto; LOCAL starts one on this machine.
+
+    Raises:
+        MissingExtra: Ray is not installed.
+        ValueError: nothing answers there, or it has no cores.
+    """
+    ray = need("ray", "ray")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody asked for reports
+    if not ray.is_initialized():
+        try:
+            ray.init(address=address, logging_level="ERROR", log_to_driver=False)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise ValueError(f"no Ray cluster answers at {address!r}: {error}") from error
+    cores = int(ray.cluster_resources().get("CPU", 0))
+    if cores < 1:
+        raise ValueError(f"the Ray cluster at {address!r} has no cores")
+    return cores
+
+
+class RayExecutor:
+    """Runs each job as a Ray task; a run's files travel with it, both ways.
+
+    Args:
+        slots: jobs at once, >= 1; Ray starts one where and when its cores are free.
+    """
+
+    def __init__(self, slots: int):
+        self.slots = slots
+        self._ray = need("ray", "ray")
+        strategies = need("ray.util.scheduling_strategies", "ray")
+        # Beside this process, so that it lives as long as somebody reads it.
+        here = strategies.NodeAffinitySchedulingStrategy(
+            self._ray.get_runtime_context().get_node_id(), soft=True
+        )
+        actor = self._ray.remote(num_cpus=0)(_Mailbox)
+        self._mailbox = actor.options(scheduling_strategy=here).remote()
+        self._jobs: dict[Any, Job] = {}  # by Ray's reference to their outcome
+        self._stopping = False
+
+    def start(self, job: Job) -> None:
+        """Begin a job."""
+        # A failure is judged here, where it is written down; Ray must not repeat it by itself.
+        task = self._ray.remote(num_cpus=job.threads, max_retries=0)(_work)
+        reference = task.remote(job.to_json(), _read_files(Path(job.folder)), self._mailbox)
+        self._jobs[reference] = job
+
+    def messages(self, timeout: float) -> list[tuple[str, Message]]:
+        """Return what the jobs told, waiting up to `timeout` seconds for one to end."""
+        ended, _ = self._ray.wait(list(self._jobs), timeout=timeout)
+        told: list[tuple[str, Message]] = self._ray.get(self._mailbox.drain.remote())
+        for reference in ended:
+            job = self._jobs.pop(reference)
+            try:
+                outcome, files = self._ray.get(reference)
+            except self._ray.exceptions.RayError as error:  # its process or its node is gone
+                told.append((job.name, {"failed": one_line(error)}))
+                continue
+            _write_files(Path(job.folder), files)
+            told.append((job.name, outcome))
+        return told
+
+    def stop(self) -> None:
+        """Ask all jobs to write a checkpoint and end; asked again, they end at once."""
+        if self._stopping:
+            for reference in self._jobs:
+                self._ray.cancel(reference, force=True)
+        self._stopping = True
+        self._ray.get(self._mailbox.stop.remote())
+
+
+class _Mailbox:
+    """An actor that keeps what the jobs tell until it is read, and tells them to stop."""
+
+    def __init__(self) -> None:
+        self._told: list[tuple[str, Message]] = []
+        self._stopping = False
+
+    def post(self, name: str, message: Message) -> bool:
+        """Keep a job's message; return whether the job should stop."""
+        self._told.append((name, message))
+        return self._stopping
+
+    def drain(self) -> list[tuple[str, Message]]:
+        """Return the messages and forget them."""
+        told, self._told = self._told, []
+        return told
+
+    def stop(self) -> None:
+        """Tell every job that posts from now on to stop."""
+        self._stopping = True
+
+
+def _work(job_json: str, files: dict[str, bytes], mailbox: Any) -> tuple[Message, dict[str, bytes]]:
+    """Do a job on a node, in a folder of its own; return how it ended and the folder's files."""
+    ray = need("ray", "ray")
+    job = Job(**json.loads(job_json))
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    last_post, stopping = -_POST_EVERY, False
+
+    def send(message: Message) -> None:
+        nonlocal last_post, stopping
+        if "figures" in message and time.monotonic() - last_post < _POST_EVERY:
+            return
+        last_post = time.monotonic()
+        stop = ray.get(mailbox.post.remote(job.name, message))
+        if stop and not stopping:  # a second signal would stop it without a checkpoint
+            stopping = True
+            signal.raise_signal(signal.SIGINT)
+
+    with tempfile.TemporaryDirectory() as root:
+        folder = Path(root) / Path(job.folder).name
+        folder.mkdir()
+        _write_files(folder, files)
+        outcome: Message = {"finished": True}
+        try:
+            run_job(replace(job, folder=str(folder)), send)
+        except KeyboardInterrupt:
+            outcome = {"stopped": True}
+        except Exception as error:
+            outcome = {"failed": one_line(error)}
+        return outcome, _read_files(folder)
+
+
+def _read_files(folder: Path) -> dict[str, bytes]:
+    """Return the files of a run's folder by their paths in it, but for hidden ones."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.startswith(".")
+    }
+
+
+def _write_files(folder: Path, files: dict[str, bytes]) -> None:
+    """Make a run's folder hold these files and no others but hidden ones."""
+    # These two say that everything else is there.
+    for name in sorted(files, key=lambda name: name in (OBJECT_STAGE, RESULT)):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, files[name])
+    for path in folder.rglob("*"):
+        gone = path.relative_to(folder).as_posix() not in files
+        if gone and path.is_file() and not path.name.startswith("."):
+            path.unlink()
