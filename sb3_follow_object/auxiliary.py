@@ -17,7 +17,7 @@ from .policies import HerPolicy
 from .tensors import lowest, matmul_at
 
 # Where each reward lives: it needs this module, so it is imported when it is asked for.
-REWARDS = {"rnd": "RndReward"}
+REWARDS = {"rnd": "RndReward", "sldr": "SldrReward"}
 _COMMON = ("name", "weight")
 _GIVEN = ("n_features",)  # what the algorithm, not the user, tells a reward
 
