@@ -202,7 +202,7 @@ def reward_class(name: Any) -> type[AuxiliaryReward]:
     """
     if isinstance(name, type) and issubclass(name, AuxiliaryReward):
         return name
-    if name not in REWARDS:
+    if not isinstance(name, str) or name not in REWARDS:
         raise ValueError(f"auxiliary has no reward {name!r}{did_you_mean(str(name), REWARDS)}")
     return getattr(import_module(f".{name}", __package__), REWARDS[name])
 

@@ -17,7 +17,7 @@ import yaml
 from stable_baselines3.td3.policies import TD3Policy
 
 from . import zoo_configs
-from .auxiliary import REWARDS, reward_class
+from .auxiliary import REWARDS, check_auxiliary, reward_class
 from .cher import GoalSelection
 from .curriculum import Curriculum
 from .envs import IDS, object_id
@@ -117,6 +117,8 @@ def run_config(
         _override(settings, name, value)
     _check(changes, schema, "--set")
     _check(settings, schema, str(path))
+    if settings.get("auxiliary"):
+        check_auxiliary(settings["auxiliary"])
     found = method_of(settings, imagine)
     if method is not None and method != found:
         raise ValueError(
@@ -346,7 +348,7 @@ def _schema() -> dict[str, dict[str, Any]]:
     of_class["curriculum"] = _parameters(Curriculum.__init__)
     of_class["object_algorithm"] = {n: v for n, v in algorithm.items() if n != "policy"}
     of_class["predictor_fit"] = _parameters(GoalPredictor.fit)
-    of_class["inverse_fit"] = _parameters(ObjectNetworks.learned)
+    of_class["inverse_fit"] = _parameters(ObjectNetworks.check_fit)
     return {"algorithm": algorithm, "class": of_class, "run": _parameters(RunConfig)}
 
 

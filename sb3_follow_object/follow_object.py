@@ -136,9 +136,10 @@ class FollowObject:
             ("curriculum", curriculum, Curriculum.__init__),
             ("object_algorithm", object_algorithm, HerDDPG.__init__),
             ("predictor_fit", predictor_fit, GoalPredictor.fit),
-            ("inverse_fit", inverse_fit, ObjectNetworks.learned),
+            ("inverse_fit", inverse_fit, ObjectNetworks.check_fit),
         ):
             check_keywords(name, given or {}, function)
+        ObjectNetworks.check_fit(**self.settings["inverse_fit"])
         self.uses_networks = reads_object_networks(algorithm or {})
         self.env_id = env_id
         self.imagine = imagine

@@ -116,11 +116,7 @@ class ObjectNetworks(nn.Module):
         Raises:
             ValueError: an argument is outside its range.
         """
-        if not hidden or min(*hidden, batch_size, updates) < 1 or learning_rate <= 0.0:
-            raise ValueError(
-                f"inverse_fit: hidden ({hidden}), batch_size ({batch_size}) and updates ({updates})"
-                f" must be at least 1 and learning_rate ({learning_rate}) > 0"
-            )
+        cls.check_fit(hidden, learning_rate, batch_size, updates)
         policy = model.policy
         assert policy.net_arch is not None
         pi, qf = get_actor_critic_arch(policy.net_arch)
@@ -143,6 +139,20 @@ class ObjectNetworks(nn.Module):
             copy.load_state_dict(critic.state_dict())
         networks._fit_inverse(model, learning_rate, batch_size, updates, seed)
         return networks
+
+    @staticmethod
+    def check_fit(
+        hidden: Sequence[int] = (256, 256, 256),
+        learning_rate: float = 1e-3,
+        batch_size: int = 256,
+        updates: int = 3000,
+    ) -> None:
+        """Raise a ValueError unless `learned` can fit the inverse model with these arguments."""
+        if not hidden or min(*hidden, batch_size, updates) < 1 or learning_rate <= 0.0:
+            raise ValueError(
+                f"inverse_fit: hidden ({hidden}), batch_size ({batch_size}) and updates ({updates})"
+                f" must be at least 1 and learning_rate ({learning_rate}) > 0"
+            )
 
     def _fit_inverse(
         self, model: HerDDPG, learning_rate: float, batch_size: int, updates: int, seed: int

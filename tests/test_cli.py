@@ -181,7 +181,7 @@ def test_predictor_of_another_task_is_refused(
         (["--env", TASK, "--config", "none.yml"], "none.yml cannot be read"),
         (["--env", TASK, "--resume"], "holds no run"),
         (["--env", TASK, "--method", "rnd", "--set", "auxiliary.hidden=[0]"], "must be >= 1"),
-        (["--env", TASK, "--method", "rnd", "--set", "auxiliary.name=rdn"], "'rdn', not 'rnd'"),
+        (["--env", TASK, "--method", "rnd", "--set", "auxiliary.name=rdn"], "did you mean 'rnd'"),
         (["--env", TASK, "--method", "sldr", "--set", "auxiliary.hidden=[8]"], "'hidden'"),
         (["--env", TASK, "--method", "cher", "--set", "replay_buffer_kwargs.cher.picks=0"], ">= 1"),
         (["--env", "FetchReach-v4", "--method", "sldr"], "has no settings for 'FetchReach-v4'"),

@@ -151,6 +151,7 @@ def test_predictor_for_another_task_is_refused(predictor: GoalPredictor, tmp_pat
         ({"n_envs": 0}, "n_envs"),
         ({"algorithm": {"batchsize": 3}}, "did you mean 'batch_size'"),
         ({"inverse_fit": {"update": 3}}, "did you mean 'updates'"),
+        ({"inverse_fit": {"updates": 0}}, r"updates \(0\) must be at least 1"),
         ({"algorithm": {"auxiliary": {"name": "x"}}}, "auxiliary has no reward 'x'"),
         ({"curriculum": {"p": 2.0}}, "p must lie in"),
         ({"curriculum": {"k_max": 51}}, "k_max must be a whole number in 1..50"),
