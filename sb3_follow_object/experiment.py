@@ -221,18 +221,22 @@ def train(
             f"{folder / OBJECT_FILE} of the finished object stage is missing, which SLDR's reward "
             "reads; put it back, or start another run"
         )
-    if stage_file.exists():
+    staged = stage_file.exists() and (predictor is not None or not run.imagine)
+    if staged:
         stage = json.loads(stage_file.read_text())
-        run.object_steps, run.object_success = stage["object_steps"], stage["object_success"]
+        # A stage that other runs share may have more than this one uses.
+        steps = "object_steps" if run.imagine else "policy_steps"
+        run.object_steps, run.object_success = stage[steps], stage["object_success"]
 
     started = time.monotonic()
     model = run.prepare()
-    if run.has_object_stage and not stage_file.exists():
+    if run.has_object_stage and not staged:
         if run.object_networks is not None:
             run.object_networks.save(folder / OBJECT_FILE)
         if run.predictor is not None:
             run.predictor.save(folder / PREDICTOR)
-        stage = {"object_steps": run.object_steps, "object_success": run.object_success}
+        stage = {"object_steps": run.object_steps, "policy_steps": run.policy_steps}
+        stage["object_success"] = run.object_success
         stage["wall_s"] = round(time.monotonic() - started, 1)
         atomic_write(stage_file, json.dumps(stage).encode())
     if object_stage_only:

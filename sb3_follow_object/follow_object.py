@@ -79,6 +79,7 @@ class FollowObject:
         model: the robot's `HerDDPG`, once the third stage has begun.
         predictor: F_phi, once the second stage has ended.
         object_steps: env steps that the first two stages cost.
+        policy_steps: those of the first one, the object policy's, where it was run here.
 
     Raises:
         ValueError: unknown task, a predictor made for another one, or an argument out of range.
@@ -151,7 +152,7 @@ class FollowObject:
         self.model: HerDDPG | None = None
         self.curriculum_callback: CurriculumCallback | None = None
         self.predictor: GoalPredictor | None = None
-        self.object_steps = 0
+        self.object_steps = self.policy_steps = 0
         self.object_success = float("nan")
         self.object_networks: ObjectNetworks | None = None
         if predictor is not None:
@@ -208,7 +209,7 @@ class FollowObject:
         env.close()
         test_env.close()
         self.report(f"  inverse model's error {self.object_networks.inverse_error:.3f}")
-        self.object_steps = model.num_timesteps
+        self.object_steps = self.policy_steps = model.num_timesteps
         self.object_success = solved.rates[-1] if solved.rates else float("nan")
         return model, solved
 

@@ -35,7 +35,6 @@ class ObjectNetworks(nn.Module):
         n_critics: whose lowest value counts.
         layer_norm: whether the critics have LayerNorm.
         clip: of the standardised inputs.
-        relative_goal: whether the way that is left is among them.
 
     Attributes:
         inverse_error: mean squared error of the inverse model at the end of its fit; NaN before.
@@ -51,7 +50,6 @@ class ObjectNetworks(nn.Module):
         n_critics: int = 1,
         layer_norm: bool = False,
         clip: float = 5.0,
-        relative_goal: bool = False,
     ) -> None:
         super().__init__()
         self.env_id = env_id
@@ -63,7 +61,6 @@ class ObjectNetworks(nn.Module):
             "n_critics": n_critics,
             "layer_norm": layer_norm,
             "clip": clip,
-            "relative_goal": relative_goal,
         }
         self.inverse_error = float("nan")
         with th.random.fork_rng(devices=[]):  # what is drawn here is replaced
@@ -74,7 +71,6 @@ class ObjectNetworks(nn.Module):
                 net_arch={"pi": list(pi), "qf": list(qf)},
                 critic_layer_norm=layer_norm,
                 features_clip=clip,
-                relative_goal=relative_goal,
                 n_critics=n_critics,
             )
             n_inputs = policy.actor.features_dim + OBSERVATION
@@ -131,7 +127,6 @@ class ObjectNetworks(nn.Module):
             n_critics=len(model.critic.q_networks),
             layer_norm=policy.critic_layer_norm,
             clip=extractor.clip,
-            relative_goal=extractor.relative_goal,
         ).to(model.device)
         networks.extractor.load_state_dict(extractor.state_dict())
         networks.nu.load_state_dict(model.actor.mu.state_dict())
@@ -183,10 +178,7 @@ class ObjectNetworks(nn.Module):
 
     def features(self, states: th.Tensor, goals: th.Tensor) -> th.Tensor:
         """Standardise states (n, 12) and goals (n, 3) as the object stage did."""
-        position = states[:, :GOAL]
-        return self.extractor(
-            {"observation": states, "achieved_goal": position, "desired_goal": goals}
-        )
+        return self.extractor({"observation": states, "desired_goal": goals})
 
     def act(self, states: th.Tensor, goals: th.Tensor) -> th.Tensor:
         """Return nu's actions (n, 7)."""
@@ -277,7 +269,5 @@ def _check_shape(shape: Any) -> None:
             raise ValueError(f"{name} has hidden layers {widths!r}")
     if type(shape["n_critics"]) is not int or not 1 <= shape["n_critics"] <= _CRITICS_LIMIT:
         raise ValueError(f"n_critics is {shape['n_critics']!r}")
-    if not all(type(shape[name]) is bool for name in ("layer_norm", "relative_goal")):
-        raise ValueError("layer_norm and relative_goal must be true or false")
-    if not float(shape["clip"]) > 0.0:
-        raise ValueError(f"clip is {shape['clip']!r}")
+    if type(shape["layer_norm"]) is not bool or not float(shape["clip"]) > 0.0:
+        raise ValueError("layer_norm or clip cannot be meant")

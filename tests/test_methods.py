@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from sb3_follow_object.config import run_config
-from sb3_follow_object.experiment import RunConfig, train
+from sb3_follow_object.experiment import OBJECT_STAGE, RunConfig, claim, train
+from sb3_follow_object.grid import needs_object_stage, stage_settings
 from sb3_follow_object.object_networks import FILE, ObjectNetworks
 
 TASK = "FollowObject/PushSideGap-v0"
@@ -118,3 +120,23 @@ def test_lost_object_networks_are_missed_before_anything_starts(tmp_path: Path) 
     networks.save(tmp_path / "run" / FILE)
     with pytest.raises(ValueError, match="were made for env_id"):
         train(config, tmp_path / "run", resume=True, report=pytest.fail)
+
+
+def test_sldr_counts_of_a_shared_object_stage_what_it_uses(tmp_path: Path) -> None:
+    """The comparison copies a whole stage, with F_phi, into the folders of the runs."""
+    config = tiny_run("sldr")
+    alone = train(config, tmp_path / "alone", report=quiet)
+    both = replace(config, settings={**config.settings, "imagine": True})
+    train(both, tmp_path / "stage", report=quiet, object_stage_only=True)
+    claim(tmp_path / "shared", config)
+    for name in ("predictor", FILE, OBJECT_STAGE):
+        (tmp_path / "stage" / name).rename(tmp_path / "shared" / name)
+    shared = train(config, tmp_path / "shared", resume=True, report=quiet)
+    assert shared["object_steps"] == alone["object_steps"] == OBJECT_STEPS["sldr"]
+    policies = [
+        (tmp_path / n / "last_policy.safetensors").read_bytes() for n in ("alone", "shared")
+    ]
+    assert policies[0] == policies[1]
+    assert needs_object_stage(config) and needs_object_stage(both)
+    assert not needs_object_stage(tiny_run("rnd"))
+    assert stage_settings(config) == stage_settings(tiny_run("fo-sldr"))

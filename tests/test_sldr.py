@@ -199,13 +199,10 @@ def test_networks_are_those_of_the_trained_object(
     assert not th.equal(again.inverse[0].weight, more.inverse[0].weight)
 
 
-@pytest.mark.parametrize("relative_goal", [False, True])
 @pytest.mark.parametrize("layer_norm", [False, True])
-def test_every_shape_of_networks_can_be_copied_and_saved(
-    layer_norm: bool, relative_goal: bool, tmp_path: Path
-) -> None:
+def test_every_shape_of_networks_can_be_copied_and_saved(layer_norm: bool, tmp_path: Path) -> None:
     kwargs = {"net_arch": {"pi": [8], "qf": [8, 4]}, "n_critics": 2}
-    kwargs |= {"critic_layer_norm": layer_norm, "relative_goal": relative_goal}
+    kwargs |= {"critic_layer_norm": layer_norm}
     env = DummyVecEnv([PointObject])
     model = HerDDPG(
         "MultiInputPolicy", env, policy_kwargs=kwargs, batch_size=8, gradient_steps=1,
