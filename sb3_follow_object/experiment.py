@@ -28,6 +28,8 @@ from .files import atomic_write
 from .follow_object import FollowObject, Report, stream_seed
 from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
+from .object_networks import FILE as OBJECT_FILE
+from .object_networks import ObjectNetworks
 from .policies import load_actor, save_actor
 from .rollout import Episodes, run_episodes
 
@@ -199,10 +201,12 @@ def train(
     predictor = None
     if (folder / PREDICTOR).exists():
         predictor = GoalPredictor.load(folder / PREDICTOR, env_id=config.env_id)
+    networks = None
+    if (folder / OBJECT_FILE).exists():
+        networks = ObjectNetworks.load(folder / OBJECT_FILE, env_id=config.env_id)
     settings = copy.deepcopy(config.settings)  # SB3 writes into policy_kwargs
-    run = FollowObject(
-        config.env_id, seed=config.seed, predictor=predictor, report=report, **settings
-    )
+    given = {"predictor": predictor, "object_networks": networks, **settings}
+    run = FollowObject(config.env_id, seed=config.seed, report=report, **given)
     saved = None
     if resume and (folder / CHECKPOINT).exists():
         saved = load_tree(folder / CHECKPOINT)
@@ -212,15 +216,27 @@ def train(
     elif saved is None:  # stopped before the first checkpoint: what was evaluated begins anew
         (folder / EVALUATIONS).unlink(missing_ok=True)
     stage_file = folder / OBJECT_STAGE
-    if predictor is not None and stage_file.exists():
+    if run.uses_networks and networks is None and stage_file.exists():
+        raise ValueError(
+            f"{folder / OBJECT_FILE} of the finished object stage is missing, which SLDR's reward "
+            "reads; put it back, or start another run"
+        )
+    staged = stage_file.exists() and (predictor is not None or not run.imagine)
+    if staged:
         stage = json.loads(stage_file.read_text())
-        run.object_steps, run.object_success = stage["object_steps"], stage["object_success"]
+        # A stage that other runs share may have more than this one uses.
+        steps = "object_steps" if run.imagine else "policy_steps"
+        run.object_steps, run.object_success = stage[steps], stage["object_success"]
 
     started = time.monotonic()
     model = run.prepare()
-    if run.predictor is not None and predictor is None:
-        run.predictor.save(folder / PREDICTOR)
-        stage = {"object_steps": run.object_steps, "object_success": run.object_success}
+    if run.has_object_stage and not staged:
+        if run.object_networks is not None:
+            run.object_networks.save(folder / OBJECT_FILE)
+        if run.predictor is not None:
+            run.predictor.save(folder / PREDICTOR)
+        stage = {"object_steps": run.object_steps, "policy_steps": run.policy_steps}
+        stage["object_success"] = run.object_success
         stage["wall_s"] = round(time.monotonic() - started, 1)
         atomic_write(stage_file, json.dumps(stage).encode())
     if object_stage_only:
@@ -361,17 +377,19 @@ def _check_algorithms(run: FollowObject) -> None:
     small = {"policy": "MultiInputPolicy", "buffer_size": 10 * run.env.num_envs}
     settings = run.settings
     envs = [(run.env, settings["algorithm"])]
-    if run.imagine:
+    if run.has_object_stage:
         object_env = make_vec(object_id(run.env_id), 1)
         envs.append((object_env, settings["object_algorithm"]))
     for env, arguments in envs:
         arguments = copy.deepcopy(arguments)
+        if run.uses_networks:  # what it needs is not there yet; its settings have been checked
+            arguments.pop("auxiliary", None)
         replay = {**(arguments.get("replay_buffer_kwargs") or {}), "imagined_ratio": 0.0}
         try:
             HerDDPG(env=env, **{**arguments, **small, "replay_buffer_kwargs": replay})
         except (TypeError, AssertionError) as error:
             raise ValueError(f"the algorithm cannot be built: {error}") from error
-    if run.imagine:
+    if run.has_object_stage:
         object_env.close()
 
 

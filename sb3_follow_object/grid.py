@@ -27,6 +27,7 @@ from .experiment import (
 )
 from .files import atomic_write
 from .goal_predictor import FACTS_FILE
+from .sldr import reads_object_networks
 
 GRID, OBJECT, LOGS = "grid.json", "object", "logs"
 FINISHED, FAILED, UNFINISHED, NOT_RUN = "finished", "failed", "unfinished", "not run"
@@ -150,7 +151,8 @@ def task_name(env_id: str) -> str:
 
 def needs_object_stage(config: RunConfig) -> bool:
     """Whether a run begins with what its object learns alone."""
-    return bool(config.settings.get("imagine", True))
+    algorithm = config.settings.get("algorithm") or {}
+    return bool(config.settings.get("imagine", True)) or reads_object_networks(algorithm)
 
 
 def stage_settings(config: RunConfig) -> dict[str, Any]:

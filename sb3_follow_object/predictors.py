@@ -13,6 +13,8 @@ from .envs import physics_id
 from .experiment import RunConfig
 from .follow_object import FollowObject, Report
 from .goal_predictor import FACTS_FILE, GoalPredictor
+from .object_networks import FILE as OBJECT_FILE
+from .object_networks import ObjectNetworks
 
 CACHE_VARIABLE = "SB3_FOLLOW_OBJECT_CACHE"
 
@@ -32,18 +34,31 @@ def get_predictor(
         ValueError: the folder holds a predictor for another task or other physics, or a damaged
             one; or the id is not of this package.
     """
-    physics = physics_id(env_id)
-    path = cache_folder() / env_id / physics if folder is None else Path(folder)
+    path = _kept(FACTS_FILE, env_id, folder, report)
+    return GoalPredictor.load(path.parent, env_id=env_id, physics=physics_id(env_id))
+
+
+def get_object_networks(
+    env_id: str, folder: str | os.PathLike[str] | None = None, report: Report = print
+) -> ObjectNetworks:
+    """Return what SLDR needs of a task's object stage; kept beside F_phi, see `get_predictor`."""
+    path = _kept(OBJECT_FILE, env_id, folder, report)
+    return ObjectNetworks.load(path, env_id=env_id, physics=physics_id(env_id))
+
+
+def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report: Report) -> Path:
+    """Return a file of a task's first two stages, which run unless it is there already."""
+    path = cache_folder() / env_id / physics_id(env_id) if folder is None else Path(folder)
     with _lock(path):
-        if not (path / FACTS_FILE).exists():
+        if not (path / name).exists():
             learn_predictor(run_config(env_id), path, report)
-    return GoalPredictor.load(path, env_id=env_id, physics=physics)
+    return path / name
 
 
 def learn_predictor(
     config: RunConfig, folder: str | os.PathLike[str], report: Report = print
 ) -> GoalPredictor:
-    """Run stages one and two (paper, sections 4.1 and 4.2) and save F_phi in a folder."""
+    """Run stages one and two (paper, sections 4.1 and 4.2) and save what they learn in a folder."""
     run = FollowObject(
         config.env_id, seed=config.seed, report=report, **{**config.settings, "n_envs": 1}
     )
@@ -51,7 +66,9 @@ def learn_predictor(
         predictor = run.learn_predictor()
     finally:
         run.close()
+    assert run.object_networks is not None
     predictor.save(folder)
+    run.object_networks.save(Path(folder) / OBJECT_FILE)
     return predictor
 
 
