@@ -20,6 +20,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from .curriculum import Curriculum
 from .envs import IDS, make_vec
 from .files import atomic_write
+from .her_ddpg import HerDDPG
 from .rollout import Observation, OnStep, Policy, run_episodes
 from .wrappers import ImaginedGoalVecEnv, imagination_of
 
@@ -122,7 +123,7 @@ class CurriculumCallback(BaseCallback):
     def _test(self) -> None:
         buffer = self._open_buffer()
         episodes = run_episodes(
-            noise_free(self.model),
+            noise_free(self.model, learning=True),
             self.test_env,
             self.n_episodes,
             on_step=None if buffer is None else self._storing(buffer),
@@ -335,13 +336,19 @@ class OriginalGoalEvalCallback(BaseCallback):
         atomic_write(path, text.getvalue().encode())
 
 
-def noise_free(model: BaseAlgorithm) -> Policy:
-    """Return the model's deterministic policy on observations as the environments give them."""
+def noise_free(model: BaseAlgorithm, learning: bool = False) -> Policy:
+    """Return the model's deterministic policy on observations as the environments give them.
+
+    Args:
+        model: any algorithm of SB3.
+        learning: of a HerDDPG that averages its actor, the actor that learns instead.
+    """
+    player = model.actor if learning and isinstance(model, HerDDPG) else model
     normaliser = model.get_vec_normalize_env()
 
     def policy(obs: Observation) -> np.ndarray:
         seen = obs if normaliser is None else normaliser.normalize_obs(obs)
-        return model.predict(seen, deterministic=True)[0]
+        return player.predict(seen, deterministic=True)[0]
 
     return policy
 

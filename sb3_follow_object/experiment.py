@@ -30,7 +30,7 @@ from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
-from .policies import load_actor, save_actor
+from .policies import load_actor
 from .rollout import Episodes, run_episodes
 
 CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
@@ -263,9 +263,9 @@ def train(
     with _stop_on_signals(callback):
         run.learn(config.total_timesteps, callback=CallbackList([evaluation, callback]))
 
-    save_actor(folder / LAST_POLICY, model.actor, config.env_id)
+    run.save_policy(folder / LAST_POLICY)
     if not (folder / POLICY).exists():
-        save_actor(folder / POLICY, model.actor, config.env_id)
+        run.save_policy(folder / POLICY)
     episodes = evaluate(folder / POLICY, config.env_id, config.n_final_episodes, config.seed)
     result = {
         "task": config.env_id.removeprefix("FollowObject/").removesuffix("-v0"),

@@ -397,10 +397,10 @@ class FollowObject:
         return run
 
     def save_policy(self, path: str | os.PathLike[str]) -> None:
-        """Save the robot's actor alone: a small file that `load_actor` reads."""
+        """Save the actor that `predict` uses alone: a small file that `load_actor` reads."""
         if self.model is None:
             raise ValueError("nothing has been learned yet: call learn() first")
-        save_actor(path, self.model.actor, self.env_id)
+        save_actor(path, self.model.policy.actor_average, self.env_id)
 
     def close(self) -> None:
         """Close all environments."""

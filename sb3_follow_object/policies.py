@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from typing import Any
 
@@ -10,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
@@ -64,6 +65,9 @@ class LayerNormCritic(ContinuousCritic):
 class HerPolicy(TD3Policy):
     """Actor and critics of three layers of 256 on normalised observations and goals.
 
+    `predict` asks `actor_average`, a running average of the actor's weights, or the actor itself
+    unless `HerDDPG` is told to average; `actor` is the one that learns and explores.
+
     Args:
         critic_layer_norm: LayerNorm after each hidden layer of the critics. Beyond the paper.
         features_clip: see `NormalizedGoalExtractor`.
@@ -99,6 +103,25 @@ class HerPolicy(TD3Policy):
             **kwargs,
         )
 
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.actor_average = copy.deepcopy(self.actor)
+        del self.actor_average.optimizer
+        self.actor_average.requires_grad_(False)
+        self.actor_average.set_training_mode(False)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.actor_average(observation)
+
+    @th.no_grad()
+    def update_average(self, decay: float) -> None:
+        """Move the averaged actor towards the actor, keeping the share `decay` in [0, 1] of it."""
+        average, live = list(self.actor_average.parameters()), list(self.actor.parameters())
+        if decay == 0.0:  # exactly, to the last bit
+            th._foreach_copy_(average, live)
+        else:
+            th._foreach_lerp_(average, live, 1.0 - decay)
+
     def make_critic(
         self, features_extractor: BaseFeaturesExtractor | None = None
     ) -> ContinuousCritic:
@@ -109,7 +132,8 @@ class HerPolicy(TD3Policy):
 
     def set_moments(self, mean: th.Tensor, std: th.Tensor) -> None:
         """Give every network the same moments, (features_dim,) each."""
-        for net in (self.actor, self.actor_target, self.critic, self.critic_target):
+        actors = (self.actor, self.actor_target, self.actor_average)
+        for net in (*actors, self.critic, self.critic_target):
             extractor = net.features_extractor
             assert isinstance(extractor, NormalizedGoalExtractor)
             extractor.mean.copy_(mean)

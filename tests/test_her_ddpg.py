@@ -107,6 +107,36 @@ def test_matmul_precision_is_that_of_the_update_alone() -> None:
     np.testing.assert_allclose(q_values[0], q_values[1], atol=0.5)
 
 
+def test_predict_uses_the_averaged_actor_and_exploration_the_live_one() -> None:
+    plain, averaged = make_model(), make_model(average_decay=0.99, noise_std=0.0)
+    for model in (plain, averaged):
+        model.random_action_prob = 0.0
+        model.learn(400, log_interval=None)  # type: ignore[arg-type]
+    for a, b in zip(plain.actor.parameters(), plain.policy.actor_average.parameters(), strict=True):
+        assert th.equal(a, b)
+    obs = averaged._last_obs
+    live = averaged.actor.predict(obs, deterministic=True)[0]  # type: ignore[arg-type]
+    shown = averaged.predict(obs, deterministic=True)[0]  # type: ignore[arg-type]
+    assert np.abs(live - shown).max() > 1e-4
+    np.testing.assert_allclose(averaged._sample_action(0, None, 4)[0], live, atol=1e-6)
+    again = averaged.actor.predict(obs, deterministic=True)[0]  # type: ignore[arg-type]
+    np.testing.assert_array_equal(again, live)
+
+
+def test_average_of_the_actor_is_a_plain_mean_at_first() -> None:
+    model = make_model(average_decay=0.999)
+    seen = []
+    update = model.policy.update_average
+
+    def spy(decay: float) -> None:
+        seen.append(decay)
+        update(decay)
+
+    model.policy.update_average = spy  # type: ignore[method-assign]
+    model.learn(4 * 3 * HORIZON, log_interval=None)  # type: ignore[arg-type]
+    assert seen[:3] == pytest.approx([0.0, 1 / 2, 2 / 3])
+
+
 def test_action_l2_keeps_actions_small() -> None:
     sizes = []
     for weight in (0.0, 10.0):
@@ -217,6 +247,7 @@ def test_environment_without_goals_is_refused() -> None:
         ({"random_action_prob": 1.5}, "random_action_prob is 1.5; it must lie in"),
         ({"noise_std": -1.0}, "must be >= 0"),
         ({"target_update_interval": 0}, "target_update_interval is 0"),
+        ({"average_decay": 1.0}, "average_decay is 1.0"),
         ({"matmul_precision": "low"}, "matmul_precision is 'low'"),
         ({"policy_kwargs": {"features_extractor_class": object}}, "leave features_extractor"),
         ({"target_clip": "wide"}, "target_clip is 'wide'"),
