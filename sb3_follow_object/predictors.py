@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from .config import run_config
 from .envs import physics_id
-from .experiment import RunConfig
+from .files import lock
 from .follow_object import FollowObject, Report
 from .goal_predictor import FACTS_FILE, GoalPredictor
+from .object_policy import keeps_object_on_table
+from .run_folder import RunConfig
 
 CACHE_VARIABLE = "SB3_FOLLOW_OBJECT_CACHE"
 
@@ -29,15 +29,17 @@ def get_predictor(
         report: called with a sentence now and then while it is learned, which takes minutes.
 
     Raises:
-        ValueError: the folder holds a predictor for another task or other physics, or a damaged
-            one; or the id is not of this package.
+        ValueError: the folder holds a predictor for another task, other physics or another
+            object_on_table, or a damaged one; or the id is not of this package.
     """
     physics = physics_id(env_id)
     path = cache_folder() / env_id / physics if folder is None else Path(folder)
-    with _lock(path):
+    path.mkdir(parents=True, exist_ok=True)
+    with lock(path, wait=True):  # those of a SubprocVecEnv come together
         if not (path / FACTS_FILE).exists():
             learn_predictor(run_config(env_id), path, report)
-    return GoalPredictor.load(path, env_id=env_id, physics=physics)
+    on_table = keeps_object_on_table(env_id)
+    return GoalPredictor.load(path, env_id=env_id, physics=physics, object_on_table=on_table)
 
 
 def learn_predictor(
@@ -66,17 +68,3 @@ def cache_folder() -> Path:
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "sb3_follow_object"
-
-
-@contextmanager
-def _lock(folder: Path) -> Iterator[None]:
-    """Let one process at a time look for a predictor: those of a SubprocVecEnv come together."""
-    try:
-        import fcntl
-    except ImportError:  # not POSIX: two may then learn the same predictor
-        yield
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / ".lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # ends with the process, however that ends
-        yield
