@@ -102,6 +102,8 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
         raise ValueError(
             f"Unknown environment id {env_id!r}{did_you_mean(env_id, known)}."
         ) from error
+    except TypeError as error:
+        raise ValueError(f"{env_id!r} cannot be made: {error}") from error
     if seed is not None:
         venv.seed(seed)
     return venv

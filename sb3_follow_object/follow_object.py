@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from .callbacks import CurriculumCallback
 from .checkpoint import load_tree, save_tree
 from .curriculum import Curriculum
-from .envs import make_vec, object_id, physics_id
+from .envs import IDS, make_vec, object_id, physics_id
 from .files import atomic_write
 from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
@@ -385,12 +385,14 @@ class FollowObject:
             self.curriculum_callback.test_env.close()
 
     def _robot_env(self, purpose: str) -> VecEnv:
-        env = make_vec(
-            self.env_id,
-            self.settings["n_envs"],
-            self.settings["n_threads"],
-            reward_type=self.settings["reward_type"],
+        reward_type = self.settings["reward_type"]
+        # Environments of others need not know the word; theirs are sparse unless asked.
+        options = (
+            {}
+            if self.env_id not in IDS and reward_type == "sparse"
+            else {"reward_type": reward_type}
         )
+        env = make_vec(self.env_id, self.settings["n_envs"], self.settings["n_threads"], **options)
         env.seed(stream_seed(self.seed, purpose))
         return env
 

@@ -187,8 +187,9 @@ def collect_paths(model: Any, env: VecEnv, n_episodes: int) -> ObjectPaths:
             current.append(obs["achieved_goal"].copy())
         current.append(next_obs["achieved_goal"].copy())
         if dones.all():
-            paths.append(np.stack(current, axis=1))
-            goals.append(obs["desired_goal"].copy())
+            good = ["diverged" not in info for info in infos]
+            paths.append(np.stack(current, axis=1)[good])
+            goals.append(obs["desired_goal"][good])
             current.clear()
         elif dones.any():
             raise ValueError("the object's episodes differ in length; F_phi needs a fixed horizon")

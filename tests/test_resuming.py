@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import torch as th
 from sb3_follow_object.checkpoint import load_tree, save_tree
 from sb3_follow_object.experiment import train
 from sb3_follow_object.follow_object import FollowObject
-from sb3_follow_object.run_folder import checkpoint_files
+from sb3_follow_object.run_folder import Checkpoints, checkpoint_files, load_newest
 
 pytestmark = pytest.mark.xdist_group("resuming")  # the tests share one run
 
@@ -99,34 +100,48 @@ def test_crash_before_the_first_checkpoint_starts_again(
     assert runs.outcome(tmp_path / "run") == whole
 
 
-@pytest.fixture
-def crashed(tmp_path: Path) -> Iterator[Path]:
-    """A run that ended between two evaluations of the third stage."""
+@pytest.fixture(scope="module")
+def crashed_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("crashed") / "run"
 
     def crash(figures: dict[str, Any]) -> None:
         if figures["env_steps"] > 2600:
             raise Crash
 
-    with pytest.raises(RuntimeError):
-        train(runs.config(), tmp_path / "run", report=runs.quiet, progress=crash)
-    yield tmp_path / "run"
+    with pytest.raises(RuntimeError, match="Crash"):
+        train(runs.config(), folder, report=runs.quiet, progress=crash)
+    return folder
 
 
-@pytest.mark.parametrize("damage", ["flip", "cut", "empty"])
+@pytest.fixture
+def crashed(crashed_once: Path, tmp_path: Path) -> Path:
+    """A run that ended in the third stage, with two checkpoints."""
+    return Path(shutil.copytree(crashed_once, tmp_path / "run"))
+
+
 def test_damaged_checkpoint_gives_way_to_the_one_before_it(
-    crashed: Path, whole: dict[str, Any], damage: str
+    crashed: Path, whole: dict[str, Any]
 ) -> None:
     before, newest = checkpoint_files(crashed)
     data = bytearray(newest.read_bytes())
-    if damage == "flip":
-        data[-100] ^= 4
-    newest.write_bytes(data[: {"flip": len(data), "cut": 1000, "empty": 0}[damage]])
+    data[-100] ^= 4
+    newest.write_bytes(data)
     told: list[str] = []
     train(runs.config(), crashed, resume=True, report=told.append)
     (sentence,) = (said for said in told if "taking the one before it" in said)
-    assert newest.name in sentence
+    assert newest.name in sentence and "does not match its checksum" in sentence
     assert f"resumed at {int(before.stem.split('-')[1])} env steps" in told
     assert runs.outcome(crashed) == whole
+
+
+@pytest.mark.parametrize("size", [0, 7, 100, 1000])
+def test_truncated_checkpoint_gives_way_to_the_one_before_it(crashed: Path, size: int) -> None:
+    before, newest = checkpoint_files(crashed)
+    newest.write_bytes(newest.read_bytes()[:size])
+    told: list[str] = []
+    state = load_newest(crashed, told.append)
+    assert state["run"]["model"]["counters"] == load_tree(before)["run"]["model"]["counters"]
+    assert len(told) == 1 and newest.name in told[0]
 
 
 def test_run_with_no_whole_checkpoint_is_refused(crashed: Path) -> None:
@@ -136,15 +151,12 @@ def test_run_with_no_whole_checkpoint_is_refused(crashed: Path) -> None:
         runs.run(crashed, resume=True)
 
 
-def test_deleted_predictor_is_missed(crashed: Path, whole: dict[str, Any]) -> None:
-    facts = crashed / "predictor" / "predictor.json"
-    kept = facts.read_bytes()
-    facts.unlink()
+def test_deleted_predictor_is_missed(crashed: Path) -> None:
+    before = {path: path.read_bytes() for path in checkpoint_files(crashed)}
+    shutil.rmtree(crashed / "predictor")
     with pytest.raises(RuntimeError, match="predictor is missing or incomplete"):
         runs.run(crashed, resume=True)
-    facts.write_bytes(kept)
-    runs.run(crashed, resume=True)
-    assert runs.outcome(crashed) == whole
+    assert {path: path.read_bytes() for path in checkpoint_files(crashed)} == before
 
 
 def test_predictor_of_another_object_is_refused(crashed: Path) -> None:
@@ -156,13 +168,27 @@ def test_predictor_of_another_object_is_refused(crashed: Path) -> None:
 
 
 def test_only_the_last_checkpoints_are_kept(tmp_path: Path) -> None:
-    def crash(figures: dict[str, Any]) -> None:
-        raise Crash
+    checkpoints = Checkpoints(tmp_path, 3, runs.quiet)
+    for steps in (10, 20, 30, 40, 25, 27):  # after 40 the run is taken up again at 20
+        checkpoints.write(steps, {"steps": steps})
+    checkpoints.wait()
+    kept = [load_tree(path)["steps"] for path in checkpoint_files(tmp_path)]
+    assert kept == [20, 25, 27] or kept == [25, 27]
+    checkpoints.remove()
+    assert not checkpoint_files(tmp_path)
 
-    config = runs.config(keep_checkpoints=3)
-    with pytest.raises(RuntimeError):
-        train(config, tmp_path / "run", report=runs.quiet, progress=crash)
-    assert len(checkpoint_files(tmp_path / "run")) == 3
+
+def test_checkpoint_holds_what_was_when_it_was_taken(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, 2, runs.quiet)
+    store = np.zeros((1000, 50))
+    for steps, used in ((1, 10), (2, 900), (3, 1000)):
+        store[:used] = steps
+        checkpoints.write(steps, {"slots": store[:used]})
+        store[:] = -1.0  # the training goes on while the file is being written
+    checkpoints.wait()
+    for steps, used in ((2, 900), (3, 1000)):
+        slots = load_tree(tmp_path / f"checkpoint-{steps:012}.safetensors")["slots"]
+        assert slots.shape == (used, 50) and (slots == steps).all()
 
 
 def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
