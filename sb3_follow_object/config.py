@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import yaml
 from stable_baselines3.td3.policies import TD3Policy
 
 from . import zoo_configs
@@ -28,6 +27,7 @@ from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .methods import METHODS as METHODS
+from .plain_yaml import load_yaml
 from .policies import HerPolicy
 
 PRESETS = ("default", "paper")
@@ -53,6 +53,13 @@ _NOT_SETTINGS |= {"paths", "goals", "physics", "progress", "n_features"}
 
 _AT_LEAST_ONE = {"n_timesteps", "batch_size", "buffer_size", "gradient_steps", "n_paths"}
 _AT_LEAST_ONE |= {"object_timesteps", "object_n_envs", "test_every", "n_test_episodes", "n_threads"}
+
+# What is more cannot be meant, and would fill the memory.
+_AT_MOST = {"n_envs": 4096, "object_n_envs": 4096, "n_threads": 1024, "torch_threads": 1024}
+_AT_MOST |= {"batch_size": 10**6, "n_sampled_goal": 1000, "n_critics": 16, "n_levels": 10**4}
+_AT_MOST |= {"buffer_size": 10**8, "n_paths": 10**6, "keep_checkpoints": 1000}
+_LARGEST = 10**15  # of all other whole numbers
+_LAYERS, _WIDTH = 16, 8192
 
 
 def preset_file(method: str, preset: str = "default") -> Path:
@@ -155,7 +162,7 @@ def load_config(folder: str | os.PathLike[str]) -> RunConfig:
         return RunConfig(**{**saved, "settings": _with_tuples(saved["settings"])})
     except FileNotFoundError as error:
         raise ValueError(f"{folder} holds no run: there is no {path}") from error
-    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
+    except (OSError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not the configuration of a run ({error})") from error
 
 
@@ -169,10 +176,9 @@ def parse_override(text: str) -> tuple[str, Any]:
     if not equals or not name:
         raise ValueError(f"{text!r} is no setting; write key=value or key.sub=value")
     try:
-        parsed = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise ValueError(f"the value of {text!r} is not YAML") from error
-    return name, _plain(parsed)
+        return name, _plain(load_yaml(value))
+    except ValueError as error:
+        raise ValueError(f"the value of {text!r} is not YAML: {error}") from error
 
 
 def check_task(env_id: str) -> None:
@@ -220,11 +226,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
         ValueError: the file is missing, is not YAML, or is not such a mapping.
     """
     try:
-        entries = yaml.safe_load(path.read_text())
+        entries = load_yaml(path.read_text())
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    except ValueError as error:
+        raise ValueError(f"{path} is not YAML: {error}") from error
     if not isinstance(entries, dict):
         raise ValueError(f"{path} is not a mapping from environment ids to settings")
     return entries
@@ -351,6 +357,25 @@ def _check_tree(settings: dict[str, Any], known: dict[str, Any], where: str) -> 
             raise ValueError(f"{where}: {name} must be {kind}, not {value!r}")
         elif name in _AT_LEAST_ONE and isinstance(value, int) and value < 1:
             raise ValueError(f"{where}: {name} is {value}; it must be at least 1")
+        elif isinstance(value, int) and abs(value) > _AT_MOST.get(name, _LARGEST):
+            limit = _AT_MOST.get(name, _LARGEST)
+            raise ValueError(f"{where}: {name} is {value:.6g}; it must be at most {limit}")
+        elif name in ("net_arch", "hidden") and value is not None:
+            _check_widths(value, f"{where}: {name}")
+
+
+def _check_widths(value: Any, where: str) -> None:
+    """Refuse networks that nobody means, before they are built."""
+    if isinstance(value, dict):  # SB3's way to give actor and critic networks of their own
+        _check_names(value, ("pi", "qf"), where)
+        for name, widths in value.items():
+            _check_widths(widths, f"{where}.{name}")
+        return
+    fits = isinstance(value, list | tuple) and len(value) <= _LAYERS
+    if not fits or not all(type(width) is int and 1 <= width <= _WIDTH for width in value):
+        raise ValueError(
+            f"{where} must be at most {_LAYERS} whole numbers in 1..{_WIDTH}, not {value!r}"
+        )
 
 
 def _check_names(settings: Any, known: Any, where: str) -> None:

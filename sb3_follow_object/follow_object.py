@@ -363,14 +363,14 @@ class FollowObject:
         folder = Path(folder)
         try:
             settings = json.loads((folder / "settings.json").read_text())
-        except (OSError, ValueError) as error:
+            predictor = None
+            if (folder / "predictor").exists():
+                predictor = GoalPredictor.load(folder / "predictor", env_id=settings["env_id"])
+            run = cls(**settings, predictor=predictor, report=report)
+            run.load_state_dict(load_tree(folder / "state.safetensors"))
+            return run
+        except (OSError, KeyError, RecursionError, TypeError, ValueError) as error:
             raise ValueError(f"{folder} holds no saved FollowObject ({error})") from error
-        predictor = None
-        if (folder / "predictor").exists():
-            predictor = GoalPredictor.load(folder / "predictor", env_id=settings["env_id"])
-        run = cls(**settings, predictor=predictor, report=report)
-        run.load_state_dict(load_tree(folder / "state.safetensors"))
-        return run
 
     def save_policy(self, path: str | os.PathLike[str]) -> None:
         """Save the robot's actor alone: a small file that `load_actor` reads."""

@@ -26,6 +26,11 @@ PACKAGES = ["sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-ro
 PACKAGES += ["mujoco", "torch", "numpy"]
 
 
+# The whole numbers of a run and the least that each may be.
+_WHOLE_NUMBERS = {"seed": 0, "total_timesteps": 1, "eval_every": 1, "n_eval_episodes": 1}
+_WHOLE_NUMBERS |= {"n_final_episodes": 1, "keep_checkpoints": 1, "torch_threads": 1}
+
+
 @dataclass(frozen=True)
 class RunConfig:
     """What decides a run.
@@ -58,18 +63,10 @@ class RunConfig:
     torch_threads: int = 1
 
     def __post_init__(self) -> None:
-        for name in (
-            "total_timesteps",
-            "eval_every",
-            "n_eval_episodes",
-            "n_final_episodes",
-            "keep_checkpoints",
-            "torch_threads",
-        ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}; it must be at least 0")
+        for name, low in _WHOLE_NUMBERS.items():
+            value = getattr(self, name)
+            if type(value) is not int or value < low:
+                raise ValueError(f"{name} is {value!r}; it must be at least {low}")
         if not self.checkpoint_minutes > 0.0:
             raise ValueError(f"checkpoint_minutes is {self.checkpoint_minutes}; it must be > 0")
 
