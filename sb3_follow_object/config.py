@@ -29,6 +29,7 @@ from .her_replay_buffer import FollowObjectReplayBuffer
 from .methods import METHODS as METHODS
 from .plain_yaml import load_yaml
 from .policies import HerPolicy
+from .ranges import check_value
 
 PRESETS = ("default", "paper")
 
@@ -50,16 +51,6 @@ _NOT_SETTINGS |= {"predictor", "report", "_init_setup_model", "tensorboard_log",
 _NOT_SETTINGS |= {"replay_buffer_class", "total_timesteps", "horizon", "args", "kwargs"}
 _NOT_SETTINGS |= {"observation_space", "action_space", "lr_schedule", "reward_function"}
 _NOT_SETTINGS |= {"paths", "goals", "physics", "progress", "n_features"}
-
-_AT_LEAST_ONE = {"n_timesteps", "batch_size", "buffer_size", "gradient_steps", "n_paths"}
-_AT_LEAST_ONE |= {"object_timesteps", "object_n_envs", "test_every", "n_test_episodes", "n_threads"}
-
-# What is more cannot be meant, and would fill the memory.
-_AT_MOST = {"n_envs": 4096, "object_n_envs": 4096, "n_threads": 1024, "torch_threads": 1024}
-_AT_MOST |= {"batch_size": 10**6, "n_sampled_goal": 1000, "n_critics": 16, "n_levels": 10**4}
-_AT_MOST |= {"buffer_size": 10**8, "n_paths": 10**6, "keep_checkpoints": 1000}
-_LARGEST = 10**15  # of all other whole numbers
-_LAYERS, _WIDTH = 16, 8192
 
 
 def preset_file(method: str, preset: str = "default") -> Path:
@@ -336,6 +327,7 @@ def _schema() -> dict[str, dict[str, Any]]:
     of_class["curriculum"] = _parameters(Curriculum.__init__)
     of_class["object_algorithm"] = {n: v for n, v in algorithm.items() if n != "policy"}
     of_class["predictor_fit"] = _parameters(GoalPredictor.fit)
+    del of_class["predictor_fit"]["object_on_table"]  # the class's
     return {"algorithm": algorithm, "class": of_class, "run": _parameters(RunConfig)}
 
 
@@ -355,27 +347,8 @@ def _check_tree(settings: dict[str, Any], known: dict[str, Any], where: str) -> 
         elif not _fits(value, default):
             kind = "true or false" if isinstance(default, bool) else f"like {default!r}"
             raise ValueError(f"{where}: {name} must be {kind}, not {value!r}")
-        elif name in _AT_LEAST_ONE and isinstance(value, int) and value < 1:
-            raise ValueError(f"{where}: {name} is {value}; it must be at least 1")
-        elif isinstance(value, int) and abs(value) > _AT_MOST.get(name, _LARGEST):
-            limit = _AT_MOST.get(name, _LARGEST)
-            raise ValueError(f"{where}: {name} is {value:.6g}; it must be at most {limit}")
-        elif name in ("net_arch", "hidden") and value is not None:
-            _check_widths(value, f"{where}: {name}")
-
-
-def _check_widths(value: Any, where: str) -> None:
-    """Refuse networks that nobody means, before they are built."""
-    if isinstance(value, dict):  # SB3's way to give actor and critic networks of their own
-        _check_names(value, ("pi", "qf"), where)
-        for name, widths in value.items():
-            _check_widths(widths, f"{where}.{name}")
-        return
-    fits = isinstance(value, list | tuple) and len(value) <= _LAYERS
-    if not fits or not all(type(width) is int and 1 <= width <= _WIDTH for width in value):
-        raise ValueError(
-            f"{where} must be at most {_LAYERS} whole numbers in 1..{_WIDTH}, not {value!r}"
-        )
+        elif value is not None or default not in (None, inspect.Parameter.empty):
+            check_value(name, value, where)
 
 
 def _check_names(settings: Any, known: Any, where: str) -> None:

@@ -294,8 +294,11 @@ def _check_algorithms(run: FollowObject) -> None:
         replay = {**(arguments.get("replay_buffer_kwargs") or {}), "imagined_ratio": 0.0}
         try:
             HerDDPG(env=env, **{**arguments, **small, "replay_buffer_kwargs": replay})
-        except (TypeError, AssertionError) as error:
-            raise ValueError(f"the algorithm cannot be built: {error}") from error
+        except ValueError:
+            raise
+        except Exception as error:  # SB3 and torch raise anything; so do others' environments
+            reason = str(error) or type(error).__name__
+            raise ValueError(f"the algorithm cannot be built: {reason}") from error
     if run.imagine:
         object_env.close()
 
