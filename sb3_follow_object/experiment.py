@@ -106,9 +106,10 @@ def train(
             claim(folder, config)
         checkpoints = Checkpoints(folder, config.keep_checkpoints, report)
         stack.callback(checkpoints.wait)
-        saved = load_newest(folder, report) if resume else None
+        # In a list that is emptied: it holds a replay buffer's worth of memory.
+        loaded = [load_newest(folder, report) if resume else None]
         try:
-            return _run_stages(config, folder, run, saved, checkpoints, stop, progress, command)
+            return _run_stages(config, folder, run, loaded, checkpoints, stop, progress, command)
         except Exception as error:
             checkpoints.wait()
             raise _stopped(error, run, folder) from error
@@ -118,13 +119,14 @@ def _run_stages(
     config: RunConfig,
     folder: Path,
     run: FollowObject,
-    saved: Any,
+    loaded: list[Any],
     checkpoints: Checkpoints,
     stop: StopSignals,
     progress: Progress,
     command: str,
 ) -> dict[str, Any]:
     """Run what is left of the three stages and of the final test."""
+    saved = loaded.pop()
     minutes = config.checkpoint_minutes
     wall_before = 0.0
     if run.imagine:
@@ -152,7 +154,7 @@ def _run_stages(
         keeper.load_state_dict(saved)
         checkpoints.take_memory(keeper.state_dict())
         run.report(f"resumed at {run.env_steps} env steps")
-    del saved  # a replay buffer's worth of memory
+    del saved
     model.set_logger(_logger(folder, run.env_steps))
     writer = CheckpointCallback(
         checkpoints, keeper.state_dict, lambda: run.env_steps, minutes, stop
