@@ -28,6 +28,7 @@ from .run_folder import (
     CONFIG,
     EVALUATIONS,
     LAST_POLICY,
+    OBJECT_STAGE,
     POLICY,
     PREDICTOR,
     RESULT,
@@ -37,6 +38,7 @@ from .run_folder import (
     check_same_run,
     checkpoint_files,
     claim,
+    difference,
     load_newest,
     load_object_stage,
     save_object_stage,
@@ -44,8 +46,8 @@ from .run_folder import (
 )
 from .seeds import stream_seed
 
-__all__ = ["CONFIG", "EVALUATIONS", "POLICY", "PREDICTOR", "RESULT", "RunConfig"]
-__all__ += ["evaluate", "evaluation_env", "train", "trained_steps"]
+__all__ = ["CONFIG", "EVALUATIONS", "OBJECT_STAGE", "POLICY", "PREDICTOR", "RESULT", "RunConfig"]
+__all__ += ["claim", "difference", "evaluate", "evaluation_env", "train", "trained_steps"]
 
 # Evaluation copies: the paper's 380 episodes are ten from each.
 _EVAL_COPIES = 38
@@ -59,6 +61,7 @@ def train(
     report: Report = print,
     progress: Progress = lambda figures: None,
     command: str = "",
+    object_stage_only: bool = False,
 ) -> dict[str, Any]:
     """Train in a folder and return its result, also written to result.json.
 
@@ -72,6 +75,7 @@ def train(
         report: called with a sentence now and then.
         progress: called with env_steps, k_max and success_rate after each rollout.
         command: the command line to note in the result.
+        object_stage_only: end where the robot's training would begin, and return nothing.
 
     Raises:
         ValueError: the folder holds another run, none where one should be resumed, or one that
@@ -109,6 +113,11 @@ def train(
         # In a list that is emptied: it holds a replay buffer's worth of memory.
         loaded = [load_newest(folder, report) if resume else None]
         try:
+            if object_stage_only:
+                _object_stage(
+                    run, folder, loaded.pop(), checkpoints, config.checkpoint_minutes, stop
+                )
+                return {}
             return _run_stages(config, folder, run, loaded, checkpoints, stop, progress, command)
         except Exception as error:
             checkpoints.wait()

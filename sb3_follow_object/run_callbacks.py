@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from .callbacks import OriginalGoalEvalCallback
@@ -125,6 +126,9 @@ class RunCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
+        assert self.run.model is not None
+        if not all(bool(th.isfinite(w).all()) for w in self.run.model.actor.parameters()):
+            raise RuntimeError("diverged: the policy is not finite")
         n_validated = self.evaluation.n_evaluations
         if n_validated > self._n_validated:
             self._n_validated = n_validated

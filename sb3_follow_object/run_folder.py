@@ -88,20 +88,25 @@ def check_same_run(folder: Path, config: RunConfig) -> None:
     if not path.exists():
         raise ValueError(f"{folder} holds no run to resume")
     try:
-        kept = _flat(_as_json(RunConfig(**json.loads(path.read_text()))))
+        kept = asdict(RunConfig(**json.loads(path.read_text())))
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not the configuration of a run ({error})") from error
-    wanted = _flat(_as_json(config))
-    for name in {**kept, **wanted}:
-        if kept.get(name) != wanted.get(name):
-            raise ValueError(
-                f"the run in {folder} has {name} {kept.get(name)!r}, not {wanted.get(name)!r}; "
-                "resume it as it is or start another in another folder"
-            )
+    different = difference(kept, asdict(config))
+    if different is not None:
+        name, ours, theirs = different
+        raise ValueError(
+            f"the run in {folder} has {name} {ours!r}, not {theirs!r}; "
+            "resume it as it is or start another in another folder"
+        )
 
 
-def _as_json(config: RunConfig) -> dict[str, Any]:
-    return dict(json.loads(json.dumps(asdict(config))))
+def difference(kept: dict[str, Any], wanted: dict[str, Any]) -> tuple[str, Any, Any] | None:
+    """Return the first setting that differs, by its dotted name, and its two values."""
+    ours, theirs = (_flat(json.loads(json.dumps(settings))) for settings in (kept, wanted))
+    for name in {**ours, **theirs}:
+        if ours.get(name) != theirs.get(name):
+            return name, ours.get(name), theirs.get(name)
+    return None
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -114,7 +119,8 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def claim(folder: Path, config: RunConfig) -> None:
-    """Put a run's config and versions into its folder."""
+    """Create a run's folder with its config and versions: what `train(resume=True)` asks for."""
+    folder.mkdir(parents=True, exist_ok=True)
     check_empty(folder)  # again, now that no other process can come in between
     versions: dict[str, str | None] = {n: importlib.metadata.version(n) for n in PACKAGES}
     versions |= {"python": platform.python_version(), "commit": source_commit()}
