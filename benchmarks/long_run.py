@@ -2,9 +2,9 @@
 
     python benchmarks/long_run.py --steps 5000000 --out benchmarks/results/long_run
 
-Writes OUT.csv with a sample every few seconds and OUT.png. Once the replay buffer is full and both
-kinds of checkpoint memory are taken, nothing may grow: exit code 1 where the last quarter of the
-samples holds over 2% more memory, or more files or threads, than the quarter before it.
+Writes OUT.csv with a sample every few seconds and OUT.png. Once the replay buffer is full nothing may grow: exit
+code 1 where the last quarter of the samples holds over 2% more memory, or more files or threads,
+than the quarter before it.
 """
 
 from __future__ import annotations
