@@ -2,9 +2,9 @@
 
     python benchmarks/long_run.py --steps 5000000 --out benchmarks/results/long_run
 
-Writes OUT.csv with a sample every few seconds and OUT.png. Once the replay buffer is full nothing may grow: exit
-code 1 where the last quarter of the samples holds over 2% more memory, or more files or threads,
-than the quarter before it.
+Writes OUT.csv with a sample every few seconds and OUT.png. Once the replay buffer is full nothing
+may grow: exit code 1 where the last quarter of the samples holds over 2% more memory, or more files
+or threads, than the quarter before it.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def write(rows: list[dict[str, float]], full_at: int, out: Path) -> None:
     for axis, (name, label) in zip(axes, LABELS.items(), strict=True):
         axis.plot([row["env_steps"] / 1e6 for row in rows], [row[name] for row in rows])
         axis.axvline(full_at / 1e6, color="grey", linestyle=":")
-        axis.set(ylabel=label, ylim=(0, None))
+        axis.set(ylabel=label, ylim=(0, 1.1 * max(row[name] for row in rows)))
         axis.grid(alpha=0.3)
     axes[0].set_title("dotted: the replay buffer is full", fontsize=9)
     axes[-1].set_xlabel("env steps (millions)")

@@ -13,6 +13,7 @@ from .tasks import TASKS, Box, Height, Region, Task
 if TYPE_CHECKING:
     from .fetch import FetchEnv as FetchEnv
     from .fetch import FetchVecEnv as FetchVecEnv
+    from .fetch import object_state as object_state
     from .object_locomotion import ObjectEnv as ObjectEnv
     from .object_locomotion import ObjectVecEnv as ObjectVecEnv
     from .scene import object_only as object_only
@@ -23,6 +24,7 @@ _HOME = {
     "ObjectEnv": "object_locomotion",
     "ObjectVecEnv": "object_locomotion",
     "object_only": "scene",
+    "object_state": "fetch",
 }
 
 __all__ = [

@@ -16,6 +16,25 @@ from .tasks import Task, find_task
 # Added to the gripper's own quaternion each step, which turns it to point down.
 _DOWNWARD = np.array([1.0, 0.0, 1.0, 0.0])
 
+# Where an observation holds the object's position, Euler angles, linear velocity relative to the
+# gripper and angular velocity; and the gripper's velocity.
+_OBJECT = [*range(3, 6), *range(11, 20)]
+_GRIP_VELOCITY = slice(20, 23)
+
+
+def object_state(observations: Any) -> Any:
+    """The object's own observations (n, 12) within the robot's (n, 25), as `ObjectEnv` has them.
+
+    Units are the same: metres, radians, and both per env step. Only the linear velocity is told
+    differently, relative to the gripper; the gripper's is added.
+
+    Args:
+        observations: array or tensor (n, 25) of a robot task of this package.
+    """
+    state = observations[:, _OBJECT]
+    state[:, 6:9] += observations[:, _GRIP_VELOCITY]
+    return state
+
 
 class FetchSimulation(BatchedSimulation):
     """The Fetch robot: actions move gripper (3) and fingers (1), observations are v4's 25."""

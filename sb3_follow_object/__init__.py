@@ -14,6 +14,7 @@ register_envs()
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .auxiliary import AuxiliaryReward as AuxiliaryReward
     from .callbacks import CurriculumCallback as CurriculumCallback
     from .callbacks import OriginalGoalEvalCallback as OriginalGoalEvalCallback
     from .curriculum import Curriculum as Curriculum
@@ -21,10 +22,12 @@ if TYPE_CHECKING:
     from .goal_predictor import GoalPredictor as GoalPredictor
     from .her_ddpg import HerDDPG as HerDDPG
     from .her_replay_buffer import FollowObjectReplayBuffer as FollowObjectReplayBuffer
+    from .object_networks import ObjectNetworks as ObjectNetworks
     from .wrappers import ImaginedGoalVecEnv as ImaginedGoalVecEnv
     from .wrappers import ImaginedGoalWrapper as ImaginedGoalWrapper
 
 _HOME = {
+    "AuxiliaryReward": "auxiliary",
     "Curriculum": "curriculum",
     "CurriculumCallback": "callbacks",
     "FollowObject": "follow_object",
@@ -33,6 +36,7 @@ _HOME = {
     "HerDDPG": "her_ddpg",
     "ImaginedGoalVecEnv": "wrappers",
     "ImaginedGoalWrapper": "wrappers",
+    "ObjectNetworks": "object_networks",
     "OriginalGoalEvalCallback": "callbacks",
 }
 

@@ -17,7 +17,7 @@ from .policies import HerPolicy
 from .tensors import lowest, matmul_at
 
 # Where each reward lives: it needs this module, so it is imported when it is asked for.
-REWARDS = {"rnd": "RndReward"}
+REWARDS = {"rnd": "RndReward", "sldr": "SldrReward"}
 _COMMON = ("name", "weight")
 _GIVEN = ("n_features",)  # what the algorithm, not the user, tells a reward
 
@@ -202,7 +202,7 @@ def reward_class(name: Any) -> type[AuxiliaryReward]:
     """
     if isinstance(name, type) and issubclass(name, AuxiliaryReward):
         return name
-    if name not in REWARDS:
+    if not isinstance(name, str) or name not in REWARDS:
         raise ValueError(f"auxiliary has no reward {name!r}{did_you_mean(str(name), REWARDS)}")
     return getattr(import_module(f".{name}", __package__), REWARDS[name])
 

@@ -16,7 +16,7 @@ import gymnasium as gym
 from stable_baselines3.td3.policies import TD3Policy
 
 from . import zoo_configs
-from .auxiliary import REWARDS, reward_class
+from .auxiliary import REWARDS, check_auxiliary, reward_class
 from .cher import GoalSelection
 from .curriculum import Curriculum
 from .envs import IDS, object_id
@@ -27,6 +27,7 @@ from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .methods import METHODS as METHODS
+from .object_networks import ObjectNetworks
 from .plain_yaml import load_yaml
 from .policies import HerPolicy
 from .ranges import check_value
@@ -47,7 +48,15 @@ _CALLBACK_NAMES = {"every": "test_every", "n_episodes": "n_test_episodes", "stor
 
 # What the run itself decides, or what YAML cannot hold.
 _NOT_SETTINGS = {"self", "env", "env_id", "seed", "settings", "method", "imagine", "algorithm"}
-_NOT_SETTINGS |= {"predictor", "report", "_init_setup_model", "tensorboard_log", "action_noise"}
+_NOT_SETTINGS |= {
+    "model",
+    "object_networks",
+    "predictor",
+    "report",
+    "_init_setup_model",
+    "tensorboard_log",
+    "action_noise",
+}
 _NOT_SETTINGS |= {"replay_buffer_class", "total_timesteps", "horizon", "args", "kwargs"}
 _NOT_SETTINGS |= {"observation_space", "action_space", "lr_schedule", "reward_function"}
 _NOT_SETTINGS |= {"paths", "goals", "physics", "progress", "n_features"}
@@ -90,13 +99,14 @@ def run_config(
     entries = read_yaml(path)
     entry = _entry(entries, env_id, path)
     imagine = WRAPPER in _named(entry, "env_wrapper", path)
-    if imagine and env_id not in IDS:
-        raise ValueError(
-            f"{env_id!r} has no environment of its object alone, which imagined goals come from; "
-            f"train it with --method her, or one of {', '.join(sorted(IDS))}"
-        )
     settings = _flattened(entry, path)
-    if imagine and object_id(env_id) in entries:
+    has_object_stage = imagine or _auxiliary_name(settings) == "sldr"
+    if has_object_stage and env_id not in IDS:
+        raise ValueError(
+            f"{env_id!r} has no environment of its object alone, which imagined goals and SLDR's "
+            f"reward come from; train it with --method her, or one of {', '.join(sorted(IDS))}"
+        )
+    if has_object_stage and object_id(env_id) in entries:
         settings |= _object_stage(_entry(entries, object_id(env_id), path), path)
     schema = _schema()
     changes: dict[str, Any] = {}
@@ -105,6 +115,8 @@ def run_config(
         _override(settings, name, value)
     _check(changes, schema, "--set")
     _check(settings, schema, str(path))
+    if settings.get("auxiliary"):
+        check_auxiliary(settings["auxiliary"])
     found = method_of(settings, imagine)
     if method is not None and method != found:
         raise ValueError(
@@ -130,14 +142,20 @@ def run_config(
 
 def method_of(settings: Mapping[str, Any], imagine: bool) -> str:
     """Return the name of the method that settings describe: its marks joined, "her" with none."""
-    auxiliary = settings.get("auxiliary") or {}
+    auxiliary = _auxiliary_name(settings)
     marks = {
         "fo": imagine,
         "shaped": settings.get("reward_type") == "dense",
-        str(auxiliary.get("name")): bool(auxiliary),
+        auxiliary: bool(auxiliary),
         "cher": (settings.get("replay_buffer_kwargs") or {}).get("cher") is not None,
     }
     return "-".join(name for name, marked in marks.items() if marked) or "her"
+
+
+def _auxiliary_name(settings: Mapping[str, Any]) -> str:
+    """Return the name of the auxiliary reward, "" without one."""
+    auxiliary = settings.get("auxiliary")
+    return str(auxiliary.get("name", "")) if isinstance(auxiliary, dict) else ""
 
 
 def load_config(folder: str | os.PathLike[str]) -> RunConfig:
@@ -328,6 +346,7 @@ def _schema() -> dict[str, dict[str, Any]]:
     of_class["object_algorithm"] = {n: v for n, v in algorithm.items() if n != "policy"}
     of_class["predictor_fit"] = _parameters(GoalPredictor.fit)
     del of_class["predictor_fit"]["object_on_table"]  # the class's
+    of_class["inverse_fit"] = _parameters(ObjectNetworks.check_fit)
     return {"algorithm": algorithm, "class": of_class, "run": _parameters(RunConfig)}
 
 

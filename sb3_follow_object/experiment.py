@@ -21,6 +21,7 @@ from .envs import make_vec, object_id
 from .files import atomic_write, lock, remove_half_written
 from .follow_object import FollowObject, Report
 from .her_ddpg import HerDDPG
+from .object_policy import StopWhenSolved
 from .policies import load_actor, save_actor
 from .rollout import Episodes, run_episodes
 from .run_callbacks import CheckpointCallback, Progress, RunCallback, StopSignals
@@ -138,7 +139,7 @@ def _run_stages(
     saved = loaded.pop()
     minutes = config.checkpoint_minutes
     wall_before = 0.0
-    if run.imagine:
+    if run.has_object_stage:
         wall_before = _object_stage(run, folder, saved, checkpoints, minutes, stop)
     if saved is not None and saved["stage"] != "robot":
         saved = None
@@ -204,16 +205,14 @@ def _object_stage(
     minutes: float,
     stop: StopSignals,
 ) -> float:
-    """Bring F_phi: the folder's, or one learned now; return the seconds that it took."""
-    predictor, facts = load_object_stage(folder, run.env_id)
-    if predictor is not None:
-        run.use_predictor(predictor)
-        run.object_steps, run.object_success = facts["object_steps"], facts["object_success"]
-        return float(facts["wall_s"])
+    """Bring what the object's stages make, learned now or before; return the seconds it took."""
+    kept = load_object_stage(folder, run)
+    if kept is not None:
+        return kept
     if saved is not None and saved["stage"] == "robot":
         raise ValueError(
-            f"{folder / PREDICTOR} is missing or incomplete, which the robot's goals come from; "
-            "put it back, or remove the checkpoints to learn the same one again"
+            f"{folder / OBJECT_STAGE} is missing, which says what the object stage cost; "
+            "put it back, or start another run"
         )
     wall_before = 0.0 if saved is None else saved["wall_s"]
     started = time.monotonic()
@@ -221,20 +220,21 @@ def _object_stage(
     def wall_s() -> float:
         return wall_before + time.monotonic() - started
 
-    run.learn_predictor(
-        callback=lambda solved: CheckpointCallback(
+    def writer(solved: StopWhenSolved) -> CheckpointCallback:
+        return CheckpointCallback(
             checkpoints,
             lambda: {"stage": "object", "object": solved.state_dict(), "wall_s": wall_s()},
             lambda: solved.model.num_timesteps,
             minutes,
             stop,
-        ),
-        state=None if saved is None else saved["object"],
-        between_epochs=stop.check,
-    )
-    assert run.predictor is not None
-    facts = {"object_steps": run.object_steps, "object_success": run.object_success}
-    save_object_stage(folder, run.predictor, facts | {"wall_s": round(wall_s(), 1)})
+        )
+
+    state = None if saved is None else saved["object"]
+    if run.imagine:
+        run.learn_predictor(writer, state, between_epochs=stop.check)
+    else:
+        run.learn_object(writer, state)
+    save_object_stage(folder, run, wall_s())
     return wall_s()
 
 
@@ -297,11 +297,13 @@ def _check_algorithms(run: FollowObject) -> None:
     small = {"policy": "MultiInputPolicy", "buffer_size": 10 * run.env.num_envs}
     settings = run.settings
     envs = [(run.env, settings["algorithm"])]
-    if run.imagine:
+    if run.has_object_stage:
         object_env = make_vec(object_id(run.env_id), 1)
         envs.append((object_env, settings["object_algorithm"]))
     for env, arguments in envs:
         arguments = copy.deepcopy(arguments)
+        if run.uses_networks:  # what it needs is not there yet; its settings have been checked
+            arguments.pop("auxiliary", None)
         replay = {**(arguments.get("replay_buffer_kwargs") or {}), "imagined_ratio": 0.0}
         try:
             HerDDPG(env=env, **{**arguments, **small, "replay_buffer_kwargs": replay})
@@ -310,7 +312,7 @@ def _check_algorithms(run: FollowObject) -> None:
         except Exception as error:  # SB3 and torch raise anything; so do others' environments
             reason = str(error) or type(error).__name__
             raise ValueError(f"the algorithm cannot be built: {reason}") from error
-    if run.imagine:
+    if run.has_object_stage:
         object_env.close()
 
 

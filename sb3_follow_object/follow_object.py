@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
-import inspect
 import json
 import os
 from collections.abc import Callable
@@ -22,6 +20,9 @@ from .envs import IDS, make_vec, object_id, physics_id
 from .files import atomic_write
 from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
+from .keywords import check_keywords
+from .object_networks import FILE as OBJECT_FILE
+from .object_networks import ObjectNetworks
 from .object_policy import (
     StopWhenSolved,
     collect_paths,
@@ -38,6 +39,7 @@ from .resuming import (
     set_global_generators,
 )
 from .seeds import stream_seed
+from .sldr import reads_object_networks
 from .wrappers import ImaginedGoalVecEnv
 
 Report = Callable[[str], None]
@@ -54,6 +56,8 @@ class FollowObject:
         env_id: a task of this package, e.g. "FollowObject/PnPShelf-v0".
         imagine: False trains the robot on original goals only, i.e. DDPG + HER: no object stage.
         predictor: an F_phi made before for this task; skips the first two stages.
+        object_networks: of an object stage made before for this task; needed beside `predictor`
+            where `algorithm` has the auxiliary reward "sldr", which reads them.
         n_envs: parallel copies of the robot's environment, >= 1.
         n_threads: of the simulation; by default as many as there are cores.
         reward_type: "sparse" (paper) or "dense".
@@ -67,6 +71,7 @@ class FollowObject:
         object_timesteps: env steps after which the object stage gives up.
         n_paths: noise-free object paths that F_phi is fitted on.
         predictor_fit: keyword arguments of `GoalPredictor.fit`.
+        inverse_fit: keyword arguments of `ObjectNetworks.learned`, about the inverse model.
         test_every: rollouts of every copy between two tests at k_max.
         n_test_episodes: episodes a test; by default `n_envs`.
         store_tests: whether the episodes of the tests enter the replay buffer.
@@ -77,6 +82,7 @@ class FollowObject:
         model: the robot's `HerDDPG`, once the third stage has begun.
         predictor: F_phi, once the second stage has ended.
         object_steps: env steps that the first two stages cost.
+        policy_steps: those of the first one, the object policy's, where it was run here.
 
     Raises:
         ValueError: unknown task, a predictor made for another one, or an argument out of range.
@@ -88,6 +94,7 @@ class FollowObject:
         *,
         imagine: bool = True,
         predictor: GoalPredictor | None = None,
+        object_networks: ObjectNetworks | None = None,
         n_envs: int = 16,
         n_threads: int | None = None,
         reward_type: str = "sparse",
@@ -99,6 +106,7 @@ class FollowObject:
         object_timesteps: int = 400_000,
         n_paths: int = 512,
         predictor_fit: dict[str, Any] | None = None,
+        inverse_fit: dict[str, Any] | None = None,
         test_every: int = 4,
         n_test_episodes: int | None = None,
         store_tests: bool = True,
@@ -119,6 +127,7 @@ class FollowObject:
             "object_timesteps": object_timesteps,
             "n_paths": n_paths,
             "predictor_fit": dict(predictor_fit or {}),
+            "inverse_fit": dict(inverse_fit or {}),
             "test_every": test_every,
             "n_test_episodes": n_envs if n_test_episodes is None else n_test_episodes,
             "store_tests": store_tests,
@@ -131,8 +140,11 @@ class FollowObject:
             ("curriculum", curriculum, Curriculum.__init__),
             ("object_algorithm", object_algorithm, HerDDPG.__init__),
             ("predictor_fit", predictor_fit, GoalPredictor.fit),
+            ("inverse_fit", inverse_fit, ObjectNetworks.check_fit),
         ):
-            _check_keywords(name, given or {}, function)
+            check_keywords(name, given or {}, function)
+        ObjectNetworks.check_fit(**self.settings["inverse_fit"])
+        self.uses_networks = reads_object_networks(algorithm or {})
         self.env_id = env_id
         self.imagine = imagine
         self.seed = seed
@@ -143,10 +155,24 @@ class FollowObject:
         self.model: HerDDPG | None = None
         self.curriculum_callback: CurriculumCallback | None = None
         self.predictor: GoalPredictor | None = None
-        self.object_steps = 0
+        self.object_steps = self.policy_steps = 0
         self.object_success = float("nan")
+        self.object_networks: ObjectNetworks | None = None
         if predictor is not None:
             self.use_predictor(predictor)
+        if object_networks is not None:
+            object_networks.check(env_id, physics_id(env_id), "the object_networks given")
+            self.object_networks = object_networks
+        elif self.uses_networks and predictor is not None:
+            raise ValueError(
+                "the auxiliary reward 'sldr' needs the object's networks beside the predictor; "
+                f"give those of the same object stage ({OBJECT_FILE}), or neither"
+            )
+
+    @property
+    def has_object_stage(self) -> bool:
+        """Whether the object learns first, for imagined goals or for SLDR."""
+        return self.imagine or self.uses_networks
 
     # ---- stages one and two -------------------------------------------------------------------
 
@@ -170,6 +196,44 @@ class FollowObject:
             )
         self.predictor = predictor
 
+    def learn_object(
+        self,
+        callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
+        state: dict[str, Any] | None = None,
+    ) -> tuple[HerDDPG, StopWhenSolved]:
+        """Run stage one (section 4.1): the object policy, and the networks that SLDR needs.
+
+        Args:
+            callback: makes a callback from the one that tests the object's policy.
+            state: of that one; stage one goes on exactly from there.
+        """
+        settings = self.settings
+        self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
+        env, test_env = (self._object_env(name) for name in ("object", "object_test"))
+        model, solved = train_object_policy(
+            env,
+            test_env,
+            settings["object_timesteps"],
+            seed=stream_seed(self.seed, "object"),
+            report=lambda steps, rate: self.report(f"  {steps:>7} steps: success {rate:.2f}"),
+            callback=callback,
+            state=state,
+            **settings["object_algorithm"],
+        )
+        self.object_networks = ObjectNetworks.learned(
+            model,
+            self.env_id,
+            physics_id(self.env_id),
+            seed=stream_seed(self.seed, "inverse"),
+            **settings["inverse_fit"],
+        )
+        env.close()
+        test_env.close()
+        self.report(f"  inverse model's error {self.object_networks.inverse_error:.3f}")
+        self.object_steps = self.policy_steps = model.num_timesteps
+        self.object_success = solved.rates[-1] if solved.rates else float("nan")
+        return model, solved
+
     def learn_predictor(
         self,
         callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
@@ -179,27 +243,16 @@ class FollowObject:
         """Run stages one and two: object policy, then F_phi (sections 4.1 and 4.2).
 
         Args:
-            callback: makes a callback for stage one from the one that tests the object's policy.
-            state: of that one; stage one goes on exactly from there.
+            callback: as in `learn_object`.
+            state: as in `learn_object`.
             between_epochs: called while F_phi is fitted; may raise to stop.
         """
         settings = self.settings
-        self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
-        envs = {name: self._object_env(name) for name in ("object", "object_test", "paths")}
-        model, solved = train_object_policy(
-            envs["object"],
-            envs["object_test"],
-            settings["object_timesteps"],
-            seed=stream_seed(self.seed, "object"),
-            report=lambda steps, rate: self.report(f"  {steps:>7} steps: success {rate:.2f}"),
-            callback=callback,
-            state=state,
-            **settings["object_algorithm"],
-        )
-        paths = collect_paths(model, envs["paths"], settings["n_paths"])
-        for env in envs.values():
-            env.close()
-        self.object_steps = model.num_timesteps + paths.env_steps
+        model, solved = self.learn_object(callback, state)
+        env = self._object_env("paths")
+        paths = collect_paths(model, env, settings["n_paths"])
+        env.close()
+        self.object_steps += paths.env_steps
         self.object_success = paths.success_rate
         self.report(
             f"  {self.object_steps} env steps, noise-free success {paths.success_rate:.2f}"
@@ -248,6 +301,12 @@ class FollowObject:
                 store=self.settings["store_tests"],
             )
         arguments: dict[str, Any] = {"policy": "MultiInputPolicy", **self.settings["algorithm"]}
+        if self.uses_networks:
+            if self.object_networks is None:
+                self.learn_object()
+                self.report(f"  {self.object_steps} env steps")
+            networks = {"object_networks": self.object_networks}
+            arguments["auxiliary"] = {**arguments["auxiliary"], **networks}
         self.model = HerDDPG(env=self.env, seed=stream_seed(self.seed, "networks"), **arguments)
         # SB3 seeds the environment too; a run's streams are its own.
         self.env.seed(stream_seed(self.seed, "robot"))
@@ -350,6 +409,8 @@ class FollowObject:
         folder.mkdir(parents=True, exist_ok=True)
         if self.predictor is not None and not (folder / "predictor").exists():
             self.predictor.save(folder / "predictor")
+        if self.object_networks is not None and not (folder / OBJECT_FILE).exists():
+            self.object_networks.save(folder / OBJECT_FILE)
         save_tree(folder / "state.safetensors", self.state_dict(replay_buffer))
         atomic_write(folder / "settings.json", json.dumps(self.settings, indent=2).encode())
 
@@ -366,7 +427,10 @@ class FollowObject:
             predictor = None
             if (folder / "predictor").exists():
                 predictor = GoalPredictor.load(folder / "predictor", env_id=settings["env_id"])
-            run = cls(**settings, predictor=predictor, report=report)
+            networks = None
+            if (folder / OBJECT_FILE).exists():
+                networks = ObjectNetworks.load(folder / OBJECT_FILE, env_id=settings["env_id"])
+            run = cls(**settings, predictor=predictor, object_networks=networks, report=report)
             run.load_state_dict(load_tree(folder / "state.safetensors"))
             return run
         except (OSError, KeyError, RecursionError, TypeError, ValueError) as error:
@@ -408,12 +472,3 @@ class FollowObject:
         )
         env.seed(stream_seed(self.seed, purpose))
         return env
-
-
-def _check_keywords(name: str, given: dict[str, Any], function: Callable[..., Any]) -> None:
-    known = [key for key in inspect.signature(function).parameters if key not in ("self", "cls")]
-    for key in given:
-        if key not in known:
-            nearest = difflib.get_close_matches(key, known, n=1)
-            hint = f"; did you mean {nearest[0]}?" if nearest else ""
-            raise ValueError(f"{name} has no setting {key!r}{hint}")

@@ -27,6 +27,7 @@ from .experiment import (
 )
 from .files import atomic_write
 from .goal_predictor import FACTS_FILE
+from .sldr import reads_object_networks
 
 GRID, OBJECT, LOGS = "grid.json", "object", "logs"
 FINISHED, FAILED, UNFINISHED, NOT_RUN = "finished", "failed", "unfinished", "not run"
@@ -150,7 +151,8 @@ def task_name(env_id: str) -> str:
 
 def needs_object_stage(config: RunConfig) -> bool:
     """Whether a run begins with what its object learns alone."""
-    return bool(config.settings.get("imagine", True))
+    algorithm = config.settings.get("algorithm") or {}
+    return bool(config.settings.get("imagine", True)) or reads_object_networks(algorithm)
 
 
 def stage_settings(config: RunConfig) -> dict[str, Any]:
@@ -199,8 +201,8 @@ def _claim_whole(folder: Path, config: RunConfig, stage: Path | None = None) -> 
     new = folder.with_name(f".{folder.name}.new")
     shutil.rmtree(new, ignore_errors=True)
     new.mkdir(parents=True)
-    if folder.is_dir():
-        folder.rmdir()  # an empty one, as `plan` has seen
+    if _is_empty(folder):
+        shutil.rmtree(folder)
     claim(new, config)
     for path in stage.iterdir() if stage else ():
         if path.is_dir():
@@ -323,7 +325,7 @@ def _command(path: Path, env_id: str, method: str, seed: int, settings: Settings
 def _kept_config(cell: Cell) -> RunConfig | None:
     """Return the configuration of the run that the cell's folder holds already."""
     if not (cell.folder / CONFIG).exists():
-        if cell.folder.exists() and not (cell.folder.is_dir() and not any(cell.folder.iterdir())):
+        if cell.folder.exists() and not _is_empty(cell.folder):
             raise ValueError(f"{cell.folder} is not empty but holds no run; move it away")
         return None
     kept = load_config(cell.folder)
@@ -335,6 +337,11 @@ def _kept_config(cell: Cell) -> RunConfig | None:
             "settings or in another folder"
         )
     return kept
+
+
+def _is_empty(folder: Path) -> bool:
+    """Whether this is a folder with nothing in it but hidden files, such as locks."""
+    return folder.is_dir() and all(path.name.startswith(".") for path in folder.iterdir())
 
 
 def _without_shares(config: RunConfig) -> dict[str, Any]:

@@ -67,7 +67,7 @@ class HerDDPG(DDPG):
             `torch.set_float32_matmul_precision`: "medium" lets processors with bfloat16 units
             multiply in bfloat16 and add up in float32, which is faster; others ignore it.
         auxiliary: a second reward, whose critic the actor maximises beside the main one:
-            {"name": "rnd"} (or a subclass of `AuxiliaryReward` as the name),
+            {"name": "rnd"} or {"name": "sldr"} (or a subclass of `AuxiliaryReward` as the name),
             with the keyword arguments of the reward's class and "weight", 1 by default, of its
             critic. Its targets have bounds of their own; `hindsight_bound` does not touch them.
         policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.

@@ -1,3 +1,3 @@
 """The methods that have presets; kept apart from what needs torch, for the command line's help."""
 
-METHODS = ("fo", "her", "shaped", "rnd", "cher")
+METHODS = ("fo", "her", "shaped", "rnd", "sldr", "cher", "fo-sldr")

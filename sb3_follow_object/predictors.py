@@ -11,6 +11,8 @@ from .envs import physics_id
 from .files import lock
 from .follow_object import FollowObject, Report
 from .goal_predictor import FACTS_FILE, GoalPredictor
+from .object_networks import FILE as OBJECT_FILE
+from .object_networks import ObjectNetworks
 from .object_policy import keeps_object_on_table
 from .run_folder import RunConfig
 
@@ -32,20 +34,34 @@ def get_predictor(
         ValueError: the folder holds a predictor for another task, other physics or another
             object_on_table, or a damaged one; or the id is not of this package.
     """
+    path = _kept(FACTS_FILE, env_id, folder, report)
+    on_table = keeps_object_on_table(env_id)
     physics = physics_id(env_id)
-    path = cache_folder() / env_id / physics if folder is None else Path(folder)
+    return GoalPredictor.load(path.parent, env_id=env_id, physics=physics, object_on_table=on_table)
+
+
+def get_object_networks(
+    env_id: str, folder: str | os.PathLike[str] | None = None, report: Report = print
+) -> ObjectNetworks:
+    """Return what SLDR needs of a task's object stage; kept beside F_phi, see `get_predictor`."""
+    path = _kept(OBJECT_FILE, env_id, folder, report)
+    return ObjectNetworks.load(path, env_id=env_id, physics=physics_id(env_id))
+
+
+def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report: Report) -> Path:
+    """Return a file of a task's first two stages, which run unless it is there already."""
+    path = cache_folder() / env_id / physics_id(env_id) if folder is None else Path(folder)
     path.mkdir(parents=True, exist_ok=True)
     with lock(path, wait=True):  # those of a SubprocVecEnv come together
-        if not (path / FACTS_FILE).exists():
+        if not (path / name).exists():
             learn_predictor(run_config(env_id), path, report)
-    on_table = keeps_object_on_table(env_id)
-    return GoalPredictor.load(path, env_id=env_id, physics=physics, object_on_table=on_table)
+    return path / name
 
 
 def learn_predictor(
     config: RunConfig, folder: str | os.PathLike[str], report: Report = print
 ) -> GoalPredictor:
-    """Run stages one and two (paper, sections 4.1 and 4.2) and save F_phi in a folder."""
+    """Run stages one and two (paper, sections 4.1 and 4.2) and save what they learn in a folder."""
     run = FollowObject(
         config.env_id, seed=config.seed, report=report, **{**config.settings, "n_envs": 1}
     )
@@ -53,7 +69,9 @@ def learn_predictor(
         predictor = run.learn_predictor()
     finally:
         run.close()
+    assert run.object_networks is not None
     predictor.save(folder)
+    run.object_networks.save(Path(folder) / OBJECT_FILE)
     return predictor
 
 

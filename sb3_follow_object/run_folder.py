@@ -15,8 +15,10 @@ from typing import Any
 
 from .checkpoint import Camera, Snapshot, load_tree
 from .files import LOCK, atomic_write
-from .follow_object import Report
+from .follow_object import FollowObject, Report
 from .goal_predictor import FACTS_FILE, GoalPredictor
+from .object_networks import FILE as OBJECT_FILE
+from .object_networks import ObjectNetworks
 
 CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
 PREDICTOR, OBJECT_STAGE = "predictor", "object_stage.json"
@@ -154,27 +156,52 @@ def trained_steps(folder: str | os.PathLike[str]) -> int | None:
 # ---- what the first two stages leave ----------------------------------------------------------
 
 
-def save_object_stage(folder: Path, predictor: GoalPredictor, facts: dict[str, Any]) -> None:
-    """Keep F_phi and what it cost; only the last file written makes both count."""
+def save_object_stage(folder: Path, run: FollowObject, wall_s: float) -> None:
+    """Keep what the object stage made and what it cost; the last file says that all are there."""
+    if run.object_networks is not None:
+        run.object_networks.save(folder / OBJECT_FILE)
+    if run.predictor is not None:
+        run.predictor.save(folder / PREDICTOR)
+    facts = {
+        "object_steps": run.object_steps,
+        "policy_steps": run.policy_steps,
+        "object_success": run.object_success,
+        "wall_s": round(wall_s, 1),
+    }
     atomic_write(folder / OBJECT_STAGE, json.dumps(facts).encode())
-    predictor.save(folder / PREDICTOR)
 
 
-def load_object_stage(folder: Path, env_id: str) -> tuple[GoalPredictor | None, dict[str, Any]]:
-    """Return F_phi and what it cost, or None and nothing where the stages have not ended.
+def load_object_stage(folder: Path, run: FollowObject) -> float | None:
+    """Give a run what its folder's object stage made.
+
+    Returns:
+        The seconds that it took; None where it has not ended.
 
     Raises:
-        ValueError: a file is damaged or for another task.
+        ValueError: a file is missing, damaged or for another task.
     """
-    if not (folder / PREDICTOR / FACTS_FILE).exists():
-        return None, {}
-    predictor = GoalPredictor.load(folder / PREDICTOR, env_id=env_id)
     path = folder / OBJECT_STAGE
+    if not path.exists():
+        return None
+    for needed, file in (
+        (run.imagine, folder / PREDICTOR / FACTS_FILE),
+        (run.uses_networks, folder / OBJECT_FILE),
+    ):
+        if needed and not file.exists():
+            raise ValueError(
+                f"{file} of the finished object stage is missing, which the robot's training "
+                "reads; put it back, or start another run"
+            )
+    if run.imagine:
+        run.use_predictor(GoalPredictor.load(folder / PREDICTOR, env_id=run.env_id))
+    if run.uses_networks:
+        run.object_networks = ObjectNetworks.load(folder / OBJECT_FILE, env_id=run.env_id)
     try:
         facts = json.loads(path.read_text())
-        return predictor, {
-            name: facts[name] for name in ("object_steps", "object_success", "wall_s")
-        }
+        # A stage that other runs share may have more than this one uses.
+        run.object_steps = int(facts["object_steps" if run.imagine else "policy_steps"])
+        run.object_success = float(facts["object_success"])
+        return float(facts["wall_s"])
     except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} does not say what the object stage cost ({error})") from error
 

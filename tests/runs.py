@@ -19,6 +19,7 @@ TINY: dict[str, Any] = {
     "object_timesteps": 1000,
     "n_paths": 8,
     "predictor_fit": {"hidden": [8], "epochs": 1},
+    "inverse_fit": {"hidden": [8], "updates": 10},
     "curriculum": {"threshold": 0.0},  # every test advances: the curriculum is exercised
     "test_every": 1,
 }
@@ -54,7 +55,7 @@ def outcome(folder: Path) -> dict[str, Any]:
     result = json.loads((folder / "result.json").read_text())
     rows = [row.split(",") for row in (folder / "evaluations.csv").read_text().splitlines()]
     wall = rows[0].index("wall_s")
-    files = sorted([*folder.glob("*policy.safetensors"), *folder.glob("predictor/*")])
+    files = sorted([*folder.glob("*.safetensors"), *folder.glob("predictor/*")])
     return {
         "result": {name: value for name, value in result.items() if name not in WALL},
         "evaluations": [row[:wall] + row[wall + 1 :] for row in rows],

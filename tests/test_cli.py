@@ -26,6 +26,7 @@ pytestmark = pytest.mark.xdist_group("cli")  # the tests share one run
 TASK = "FollowObject/PushSideGap-v0"
 TINY_NETWORKS = ["policy_kwargs.net_arch=[8]", "batch_size=16", "gradient_steps=2"]
 TINY_STAGES = ["object_timesteps=800", "n_paths=16", "predictor_fit.epochs=1"]
+TINY_STAGES += ["inverse_fit.hidden=[8]", "inverse_fit.updates=10"]
 TINY_STAGES += ["predictor_fit.hidden=[8]", "object_algorithm.policy_kwargs.net_arch=[8]"]
 TINY_STAGES += ["object_algorithm.batch_size=16", "object_algorithm.gradient_steps=2"]
 TINY_TESTS = ["n_test_episodes=2", "eval_every=400", "n_eval_episodes=4", "n_final_episodes=8"]
@@ -78,7 +79,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_run_folder_holds_all_that_was_promised(finished: Path) -> None:
     names = {file.name for file in finished.iterdir()}
     assert {"config.json", "versions.json", "result.json", "evaluations.csv"} <= names
-    assert {"policy.safetensors", "predictor"} <= names
+    assert {"policy.safetensors", "predictor", "object_networks.safetensors"} <= names
     assert {"curve.png", "task.png", "imagined.png", "video.mp4"} <= names
     assert not [name for name in names if name.startswith("checkpoint")]
     assert {name for name in names if name.startswith(".")} == {".lock"}, "half-written files"
@@ -179,6 +180,11 @@ def test_predictor_of_another_task_is_refused(
         (["--env", TASK, "--set", "object_algorithm.random_action_prob=2"], "random_action_prob"),
         (["--env", TASK, "--config", "none.yml"], "none.yml cannot be read"),
         (["--env", TASK, "--resume"], "holds no run"),
+        (["--env", TASK, "--method", "rnd", "--set", "auxiliary.hidden=[0]"], "must be >= 1"),
+        (["--env", TASK, "--method", "rnd", "--set", "auxiliary.name=rdn"], "did you mean 'rnd'"),
+        (["--env", TASK, "--method", "sldr", "--set", "auxiliary.hidden=[8]"], "'hidden'"),
+        (["--env", TASK, "--method", "cher", "--set", "replay_buffer_kwargs.cher.picks=0"], ">= 1"),
+        (["--env", "FetchReach-v4", "--method", "sldr"], "has no settings for 'FetchReach-v4'"),
         (["--env", TASK, "--colour"], "unrecognized arguments: --colour"),
         (["--env", TASK, "--method", "magic"], "invalid choice: 'magic'"),
     ],

@@ -85,10 +85,13 @@ def test_her_differs_from_fo_by_its_imagined_goals_alone() -> None:
         assert fo["n_envs"] == her["n_envs"]
 
 
+OBJECT_STAGE = ("object_timesteps", "object_n_envs", "object_on_table", "object_algorithm")
 # What each method's file says besides her.yml's settings (fo.yml's, where goals are imagined).
 OWN = {
     "shaped": {"hindsight_bound", "target_clip", "reward_type"},
     "rnd": {"auxiliary"},
+    "sldr": {"auxiliary", *OBJECT_STAGE},
+    "fo-sldr": {"auxiliary"},
     "cher": {"replay_buffer_kwargs.cher"},
 }
 
@@ -112,7 +115,14 @@ def test_methods_differ_by_what_makes_them_alone(env_id: str, method: str, prese
     if (method, preset) == ("cher", "paper"):  # its source's batch
         assert ours.settings["algorithm"].pop("batch_size") == 64
         assert theirs.settings["algorithm"].pop("batch_size") == 4864
-    assert ours.total_timesteps == theirs.total_timesteps
+    if (method, preset) == ("sldr", "paper"):  # the object's steps are counted
+        own_steps = ours.settings["object_timesteps"]
+        assert ours.total_timesteps == theirs.total_timesteps + own_steps
+    else:
+        assert ours.total_timesteps == theirs.total_timesteps
+    if "sldr" in method:
+        fo = run_config(env_id, method="fo", preset=preset).settings
+        assert all(ours.settings.get(name) == fo.get(name) for name in OBJECT_STAGE)
     mine, others = leaves(ours.settings), leaves(theirs.settings)
     differing = {n for n in {**mine, **others} if mine.get(n) != others.get(n)}
     own = OWN[method]
@@ -135,6 +145,7 @@ def test_distances_fit_between_the_bounds_of_shaped_targets() -> None:
         ({"reward_type": "dense"}, "shaped"),
         ({"auxiliary.name": "rnd", "auxiliary.weight": 0.5}, "rnd"),
         ({"replay_buffer_kwargs.cher": {}}, "cher"),
+        ({"auxiliary.name": "sldr"}, "sldr"),
         ({"replay_buffer_kwargs.cher.picks": 9, "auxiliary.name": "rnd"}, "rnd-cher"),
     ],
 )
@@ -260,6 +271,9 @@ def test_missing_file_is_refused(tmp_path: Path) -> None:
 
 def test_imagined_goals_need_an_object_of_its_own(tmp_path: Path) -> None:
     file = write(tmp_path / "my.yml", imagining(), "FetchPush-v4")
+    with pytest.raises(ValueError, match="has no environment of its object alone"):
+        run_config("FetchPush-v4", file=file)
+    file = write(tmp_path / "my.yml", {"auxiliary": {"name": "sldr"}}, "FetchPush-v4")
     with pytest.raises(ValueError, match="has no environment of its object alone"):
         run_config("FetchPush-v4", file=file)
 

@@ -24,6 +24,7 @@ TINY: dict[str, Any] = {
     "object_timesteps": 1600,
     "n_paths": 32,
     "predictor_fit": {"hidden": (16, 16), "epochs": 1},
+    "inverse_fit": {"hidden": (16, 16), "updates": 10},
     "curriculum": {"threshold": 0.0},  # every test advances: the curriculum is exercised
 }
 STEPS_AFTER_OBJECT = 1200
@@ -148,7 +149,10 @@ def test_predictor_for_another_task_is_refused(predictor: GoalPredictor, tmp_pat
     ("arguments", "sentence"),
     [
         ({"n_envs": 0}, "n_envs"),
-        ({"algorithm": {"batchsize": 3}}, "did you mean batch_size"),
+        ({"algorithm": {"batchsize": 3}}, "did you mean 'batch_size'"),
+        ({"inverse_fit": {"update": 3}}, "did you mean 'updates'"),
+        ({"inverse_fit": {"updates": 0}}, r"updates \(0\) must be at least 1"),
+        ({"algorithm": {"auxiliary": {"name": "x"}}}, "auxiliary has no reward 'x'"),
         ({"curriculum": {"p": 2.0}}, "p must lie in"),
         ({"curriculum": {"k_max": 51}}, "k_max must be a whole number in 1..50"),
         ({"curriculum": {"threshold": -0.1}}, "threshold must lie in"),

@@ -154,7 +154,9 @@ def test_run_with_no_whole_checkpoint_is_refused(crashed: Path) -> None:
 def test_deleted_predictor_is_missed(crashed: Path) -> None:
     before = {path: path.read_bytes() for path in checkpoint_files(crashed)}
     shutil.rmtree(crashed / "predictor")
-    with pytest.raises(RuntimeError, match="predictor is missing or incomplete"):
+    with pytest.raises(
+        RuntimeError, match=r"predictor.json of the finished object stage is missing"
+    ):
         runs.run(crashed, resume=True)
     assert {path: path.read_bytes() for path in checkpoint_files(crashed)} == before
 

@@ -15,7 +15,7 @@ from sb3_follow_object import zoo
 from sb3_follow_object.envs import TASKS
 from sb3_follow_object.predictors import CACHE_VARIABLE
 
-from .tiny import HORIZON, TASK, cache_predictor
+from .tiny import HORIZON, TASK, cache_networks, cache_predictor
 from .tree import PACKAGES, run
 
 pytest.importorskip("rl_zoo3")
@@ -30,6 +30,7 @@ TINY += ["learning_starts:0", "buffer_size:4000"]
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cache")
     cache_predictor(folder)
+    cache_networks(folder)
     return folder
 
 
@@ -80,16 +81,17 @@ def test_stock_ddpg_trains_and_plays(n_envs: int, cache: Path, tmp_path: Path) -
         assert "Success rate:" in play(tmp_path, "rl_zoo3.enjoy", *stock)
 
 
-@pytest.mark.parametrize(("method", "n_envs"), [("fo", 2), ("her", 1)])
+@pytest.mark.parametrize(("method", "n_envs"), [("fo", 2), ("her", 1), ("sldr", 1)])
 def test_her_ddpg_trains_and_plays(method: str, n_envs: int, cache: Path, tmp_path: Path) -> None:
     steps = one_test("fo.yml", n_envs) if method == "fo" else 4 * HORIZON
-    file = ["--conf-file", str(CONFIGS / "her.yml")] if method == "her" else []
+    file = [] if method == "fo" else ["--conf-file", str(CONFIGS / f"{method}.yml")]
     module = "sb3_follow_object.zoo"
     out = train(tmp_path, cache, f"{module} train", *file, n_envs=n_envs, steps=steps)
     assert ("k_max" in out) == ("test_success" in out) == (method == "fo")
     assert "moved_share" in out  # only HerDDPG logs it
+    assert ("sldr/" in out) == (method == "sldr")
     check_run(tmp_path / "logs" / "her_ddpg" / "FollowObject-PushSideGap-v0_1", n_envs)
-    if method == "fo":
+    if method != "her":
         assert "Success rate:" in play(tmp_path, f"{module} enjoy")
 
 

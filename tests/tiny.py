@@ -1,4 +1,4 @@
-"""A predictor fitted in a moment, where `predictor="auto"` looks for one."""
+"""What the object stage makes, made in a moment, where `"auto"` looks for it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from sb3_follow_object.envs import TASKS, physics_id
 from sb3_follow_object.goal_predictor import GoalPredictor
+from sb3_follow_object.object_networks import FILE, ObjectNetworks
 
 NAME = "PushSideGap"
 TASK = f"FollowObject/{NAME}-v0"
@@ -23,3 +24,15 @@ def cache_predictor(cache: Path) -> None:
     facts = {"env_id": TASK, "physics": physics_id(TASK)}
     predictor = GoalPredictor.fit(paths, goal, hidden=(16,), epochs=3, **facts)
     predictor.save(cache / TASK / facts["physics"])
+
+
+def tiny_networks(env_id: str = TASK) -> ObjectNetworks:
+    """Object networks that have learned nothing."""
+    return ObjectNetworks(env_id, physics_id(env_id), pi=[8], qf=[8], inverse=[8])
+
+
+def cache_networks(cache: Path) -> None:
+    """Keep object networks in a cache folder."""
+    folder = cache / TASK / physics_id(TASK)
+    folder.mkdir(parents=True, exist_ok=True)
+    tiny_networks().save(folder / FILE)
