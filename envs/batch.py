@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +13,7 @@ import numpy as np
 
 from .scene import N_SUBSTEPS, OBJECT, TUBE, Scene, weld_targets
 
+_LOGGER = logging.getLogger("sb3_follow_object")
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 MAX_DISPLACEMENT = 0.05  # metres a step at action 1
 
@@ -62,8 +64,11 @@ class BatchedSimulation:
         self._watch("object_pos", [d.site_xpos[self._object_site] for d in self.data])
         self._watch("object_mat", [d.site_xmat[self._object_site] for d in self.data])
         self._watch("qvel", [d.qvel for d in self.data])
-        self._watch("warnings", [d.warning.number for d in self.data])
 
+        # What mujoco warned of in a copy's episode, and when; None while all is well. Such a copy
+        # rests on what it showed last until it is reset.
+        self.faults: list[str | None] = [None] * n_envs
+        self._warnings = [d.warning.number for d in self.data]
         self.steps = np.zeros(n_envs, dtype=np.int64)
         self._target_pos = np.zeros((n_envs, 3))
         self._target_quat = np.zeros((n_envs, 4))
@@ -98,6 +103,7 @@ class BatchedSimulation:
             data.mocap_pos[self._tube] = (goal[0], goal[1], self._table_top)
         self.goals[index] = goal
         self.steps[index] = 0
+        self.faults[index] = None
         mujoco.mj_forward(scene.model, data)
         self.refresh(index)
 
@@ -108,8 +114,14 @@ class BatchedSimulation:
             actions: (n_envs, action_size), clipped to [-1, 1] here.
 
         Raises:
-            RuntimeError: the simulation of a copy went out of bounds.
+            ValueError: an action is not finite.
         """
+        if not np.isfinite(actions).all():
+            index = int(np.argwhere(~np.isfinite(actions))[0, 0])
+            raise ValueError(
+                f"The action of environment {index} is {actions[index].tolist()}; "
+                "actions must be finite."
+            )
         self.control(np.clip(actions, -1.0, 1.0))
         self.steps += 1
         todo = iter(range(self.n_envs))
@@ -120,8 +132,6 @@ class BatchedSimulation:
             self._drain(todo)
             for other in others:
                 other.result()
-        if self.read["warnings"].any():
-            self._raise_diverged()
 
     def refresh(self, index: int) -> None:
         """Read one copy into the arrays of the batch."""
@@ -142,7 +152,13 @@ class BatchedSimulation:
         for row, data in zip(physics, self.data, strict=True):
             mujoco.mj_getState(self.scene.model, data, row, STATE)
         read = {f"read/{name}": values.copy() for name, values in self.read.items()}
-        return {"physics": physics, "goals": self.goals.copy(), "steps": self.steps.copy(), **read}
+        return {
+            "physics": physics,
+            "goals": self.goals.copy(),
+            "steps": self.steps.copy(),
+            "faults": list(self.faults),
+            **read,
+        }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from what `get_state` gave.
@@ -161,6 +177,7 @@ class BatchedSimulation:
             mujoco.mj_setState(self.scene.model, data, row, STATE)
         self.goals[:] = state["goals"]
         self.steps[:] = state["steps"]
+        self.faults[:] = state["faults"]
         for name, values in self.read.items():
             values[:] = state[f"read/{name}"]
 
@@ -180,12 +197,17 @@ class BatchedSimulation:
         # Threads share one range iterator: each takes the next copy, so uneven copies balance out.
         model = self.scene.model
         for index in todo:
+            if self.faults[index] is not None:
+                continue
             data = self.data[index]
             self._mocap_pos[index][...] = self._target_pos[index]
             self._mocap_quat[index][...] = self._target_quat[index]
             mujoco.mj_step(model, data, N_SUBSTEPS)
             self.after_substeps(index)
-            self.refresh(index)
+            if self._warnings[index].any():
+                self._note_fault(index)
+            else:
+                self.refresh(index)
 
     def _object_velocities(self) -> tuple[np.ndarray, np.ndarray]:
         """The object's linear and angular velocity, world frame, per env step, (n_envs, 3) each."""
@@ -195,11 +217,14 @@ class BatchedSimulation:
         matrices = self.read["object_mat"].reshape(-1, 3, 3)
         return linear * self.dt, rotate(matrices, spin) * self.dt
 
-    def _raise_diverged(self) -> None:
-        index, kind = (int(i) for i in np.argwhere(self.read["warnings"])[0])
-        raise RuntimeError(
-            f"The physics of environment {index} ({self.scene.task.name}) diverged near step "
-            f"{self.steps[index]} ({mujoco.mjtWarning(kind).name}): check the actions for NaN."
+    def _note_fault(self, index: int) -> None:
+        kind = mujoco.mjtWarning(int(np.argmax(self._warnings[index] > 0))).name
+        self.faults[index] = f"{kind.removeprefix('mjWARN_')} at step {self.steps[index]}"
+        _LOGGER.warning(
+            "the physics of environment %d (%s) diverged: %s; its episode is dropped",
+            index,
+            self.scene.task.name,
+            self.faults[index],
         )
 
 

@@ -98,9 +98,11 @@ class SingleEnv(_GoalFace, gym.Env):
     ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Move on by 0.04 s; the action (action_size,) is clipped to [-1, 1].
 
+        Where the physics diverges the episode is truncated with its last good observation, and the
+        info says "diverged".
+
         Raises:
-            ValueError: the action has another shape.
-            RuntimeError: the simulation went out of bounds.
+            ValueError: the action has another shape or is not finite.
         """
         action = np.asarray(action)
         if action.shape != self.action_space.shape:
@@ -110,8 +112,12 @@ class SingleEnv(_GoalFace, gym.Env):
         if self.render_mode == "human":
             self.render()
         achieved, desired = obs["achieved_goal"], obs["desired_goal"]
-        info = {"is_success": bool(self.is_success(achieved, desired))}
-        return obs, float(self.compute_reward(achieved, desired, info)), False, False, info
+        info: dict[str, Any] = {"is_success": bool(self.is_success(achieved, desired))}
+        fault = self.simulation.faults[0]
+        if fault is not None:
+            info["diverged"] = fault
+        reward = float(self.compute_reward(achieved, desired, info))
+        return obs, reward, False, fault is not None, info
 
     def render(self) -> np.ndarray | None:
         """A picture (480, 480, 3) with "rgb_array"; None, and a window, with "human"."""
@@ -197,9 +203,11 @@ class BatchVecEnv(_GoalFace, VecEnv):
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Move all copies on by 0.04 s; those at T start anew and tell their last observation.
 
+        A copy whose physics diverges rests on its last good observation until T, so that all
+        copies stay in step; the info at its episode's end says "diverged".
+
         Raises:
-            ValueError: the actions have another shape.
-            RuntimeError: the simulation of a copy went out of bounds.
+            ValueError: the actions have another shape or are not finite.
         """
         expected = (self.num_envs, self.simulation.action_size)
         if self._actions.shape != expected:
@@ -220,6 +228,8 @@ class BatchVecEnv(_GoalFace, VecEnv):
                 infos[index]["terminal_observation"] = {
                     key: values[index].copy() for key, values in obs.items()
                 }
+                if self.simulation.faults[index] is not None:
+                    infos[index]["diverged"] = self.simulation.faults[index]
                 self.simulation.reset(int(index), self._generators[index])
             obs = self._observations()
         if self.render_mode == "human":

@@ -90,7 +90,7 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
 
     if n_envs < 1:
         raise ValueError(f"n_envs must be at least 1, not {n_envs}.")
-    if env_id not in gym.registry:
+    if env_id.rpartition(":")[2] not in gym.registry:
         import gymnasium_robotics  # its ids are there only once it is imported
 
         gym.register_envs(gymnasium_robotics)
@@ -102,6 +102,8 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
         raise ValueError(
             f"Unknown environment id {env_id!r}{did_you_mean(env_id, known)}."
         ) from error
+    except TypeError as error:
+        raise ValueError(f"{env_id!r} cannot be made: {error}") from error
     if seed is not None:
         venv.seed(seed)
     return venv

@@ -22,6 +22,7 @@ from .envs import IDS, make_vec
 from .files import atomic_write
 from .her_ddpg import HerDDPG
 from .rollout import Observation, OnStep, Policy, run_episodes
+from .seeds import stream_seed
 from .wrappers import ImaginedGoalVecEnv, imagination_of
 
 
@@ -190,6 +191,8 @@ class OriginalGoalEvalCallback(BaseCallback):
         curriculum_callback: its tests are counted in env_steps and its k_max is noted.
         object_steps: steps that the object policy took, counted in env_steps, >= 0.
         wall_before: seconds that the object stage took, counted in wall_s.
+        seed: of the evaluations' episodes, so that a resumed run is tested on the same; None
+            leaves the environment's own generators running.
 
     Attributes:
         success_rate: of the last evaluation, None before the first.
@@ -220,6 +223,7 @@ class OriginalGoalEvalCallback(BaseCallback):
         curriculum_callback: CurriculumCallback | None = None,
         object_steps: int = 0,
         wall_before: float = 0.0,
+        seed: int | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
@@ -236,6 +240,8 @@ class OriginalGoalEvalCallback(BaseCallback):
         self._rows: list[dict[str, Any]] = []
         self._last_steps = 0
         self.n_evaluations = 0
+        self.seed = seed
+        self._resumed = False
         self._wall_before = wall_before
         self._started = time.monotonic()
 
@@ -263,6 +269,7 @@ class OriginalGoalEvalCallback(BaseCallback):
         self._last_steps = int(state["last_steps"])
         self.success_rate = state["success_rate"]
         self.n_evaluations = int(state["n_evaluations"])
+        self._resumed = True
         self._wall_before = float(state["wall_s"])
         self._started = time.monotonic()
 
@@ -285,6 +292,8 @@ class OriginalGoalEvalCallback(BaseCallback):
             return
         self._last_steps = num_timesteps
         self.n_evaluations += 1
+        if self.seed is not None:
+            self.eval_env.seed(stream_seed(self.seed, f"evaluation {self.n_evaluations}"))
         episodes = run_episodes(noise_free(self.model), self.eval_env, self.n_episodes)
         self.success_rate = episodes.success_rate
         mean_return = float(episodes.returns.mean())
@@ -317,7 +326,7 @@ class OriginalGoalEvalCallback(BaseCallback):
             rows = list(reader)
         if tuple(reader.fieldnames or ()) != self.COLUMNS:
             raise ValueError(f"{path} exists and is not a file of evaluations.")
-        if rows and self._last_steps == 0:
+        if rows and not (self._resumed or self._last_steps):
             raise ValueError(
                 f"{path} holds another run's evaluations: give another file, or load the state "
                 "that they belong to."

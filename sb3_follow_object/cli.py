@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -26,7 +28,28 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
+        message += self._nearest(message)
         self.exit(USER_ERROR, f"{PROGRAM}: {message} (see {self.prog} --help)\n")
+
+    def _nearest(self, message: str) -> str:
+        """Return what may have been meant by a word that argparse does not know."""
+        choice = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
+        option = re.search(r"unrecognized arguments: (--[\w-]+)", message)
+        near: list[str] = []
+        if choice:
+            near = get_close_matches(choice[1], re.findall(r"[\w-]+", choice[2]), n=1)
+        elif option:
+            known = {*self._options()} - {option[1]}  # another command may have it
+            near = get_close_matches(option[1], known, n=1, cutoff=0.7)
+        return f"; did you mean {near[0]!r}?" if near else ""
+
+    def _options(self) -> list[str]:
+        """Return the options of this parser and of its commands."""
+        known = list(self._option_string_actions)
+        for action in self._actions:
+            if isinstance(action.choices, dict):  # the commands
+                known += [name for parser in action.choices.values() for name in parser._options()]
+        return known
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,8 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     args.command_line = shlex.join([PROGRAM, *arguments])
     try:
         args.run_command(args)
-    except (ValueError, OSError, RuntimeError) as error:
-        print(f"{PROGRAM}: {' '.join(str(error).split())}", file=sys.stderr)
+    except (ValueError, OSError, RuntimeError, MemoryError, OverflowError) as error:
+        print(f"{PROGRAM}: {_sentence(error)}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:
         hint = "interrupted"
@@ -52,6 +75,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{PROGRAM}: {hint}", file=sys.stderr)
         return INTERRUPTED
     return 0
+
+
+def _sentence(error: Exception) -> str:
+    """Say in one line what went wrong."""
+    if isinstance(error, MemoryError):
+        return f"there is not enough memory ({error})"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.strerror}: {error.filename}"
+    return " ".join(str(error).split())
 
 
 def _parser() -> argparse.ArgumentParser:

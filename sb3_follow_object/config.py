@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import yaml
 from stable_baselines3.td3.policies import TD3Policy
 
 from . import zoo_configs
@@ -29,7 +28,9 @@ from .her_ddpg import HerDDPG
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .methods import METHODS as METHODS
 from .object_networks import ObjectNetworks
+from .plain_yaml import load_yaml
 from .policies import HerPolicy
+from .ranges import check_value
 
 PRESETS = ("default", "paper")
 
@@ -59,9 +60,6 @@ _NOT_SETTINGS |= {
 _NOT_SETTINGS |= {"replay_buffer_class", "total_timesteps", "horizon", "args", "kwargs"}
 _NOT_SETTINGS |= {"observation_space", "action_space", "lr_schedule", "reward_function"}
 _NOT_SETTINGS |= {"paths", "goals", "physics", "progress", "n_features"}
-
-_AT_LEAST_ONE = {"n_timesteps", "batch_size", "buffer_size", "gradient_steps", "n_paths"}
-_AT_LEAST_ONE |= {"object_timesteps", "object_n_envs", "test_every", "n_test_episodes", "n_threads"}
 
 
 def preset_file(method: str, preset: str = "default") -> Path:
@@ -173,7 +171,7 @@ def load_config(folder: str | os.PathLike[str]) -> RunConfig:
         return RunConfig(**{**saved, "settings": _with_tuples(saved["settings"])})
     except FileNotFoundError as error:
         raise ValueError(f"{folder} holds no run: there is no {path}") from error
-    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
+    except (OSError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not the configuration of a run ({error})") from error
 
 
@@ -187,10 +185,9 @@ def parse_override(text: str) -> tuple[str, Any]:
     if not equals or not name:
         raise ValueError(f"{text!r} is no setting; write key=value or key.sub=value")
     try:
-        parsed = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise ValueError(f"the value of {text!r} is not YAML") from error
-    return name, _plain(parsed)
+        return name, _plain(load_yaml(value))
+    except ValueError as error:
+        raise ValueError(f"the value of {text!r} is not YAML: {error}") from error
 
 
 def check_task(env_id: str) -> None:
@@ -203,8 +200,8 @@ def check_task(env_id: str) -> None:
         return
     try:
         env = gym.make(name)
-    except gym.error.Error as error:
-        raise ValueError(f"{env_id!r} cannot be made: {error}") from error
+    except Exception as error:  # an environment of somebody's may raise anything
+        raise ValueError(f"{env_id!r} cannot be made: {error or type(error).__name__}") from error
     try:
         missing = set(_GOAL_KEYS) - set(getattr(env.observation_space, "spaces", {}))
         if missing:
@@ -238,11 +235,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
         ValueError: the file is missing, is not YAML, or is not such a mapping.
     """
     try:
-        entries = yaml.safe_load(path.read_text())
+        entries = load_yaml(path.read_text())
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    except ValueError as error:
+        raise ValueError(f"{path} is not YAML: {error}") from error
     if not isinstance(entries, dict):
         raise ValueError(f"{path} is not a mapping from environment ids to settings")
     return entries
@@ -348,6 +345,7 @@ def _schema() -> dict[str, dict[str, Any]]:
     of_class["curriculum"] = _parameters(Curriculum.__init__)
     of_class["object_algorithm"] = {n: v for n, v in algorithm.items() if n != "policy"}
     of_class["predictor_fit"] = _parameters(GoalPredictor.fit)
+    del of_class["predictor_fit"]["object_on_table"]  # the class's
     of_class["inverse_fit"] = _parameters(ObjectNetworks.check_fit)
     return {"algorithm": algorithm, "class": of_class, "run": _parameters(RunConfig)}
 
@@ -368,8 +366,8 @@ def _check_tree(settings: dict[str, Any], known: dict[str, Any], where: str) -> 
         elif not _fits(value, default):
             kind = "true or false" if isinstance(default, bool) else f"like {default!r}"
             raise ValueError(f"{where}: {name} must be {kind}, not {value!r}")
-        elif name in _AT_LEAST_ONE and isinstance(value, int) and value < 1:
-            raise ValueError(f"{where}: {name} is {value}; it must be at least 1")
+        elif value is not None or default not in (None, inspect.Parameter.empty):
+            check_value(name, value, where)
 
 
 def _check_names(settings: Any, known: Any, where: str) -> None:

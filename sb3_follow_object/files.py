@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import os
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
+
+LOCK = ".lock"
 
 
-def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write ``data`` to ``path`` as a whole or not at all.
+@contextmanager
+def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a file whose content takes the name ``path`` as a whole or not at all.
 
     The bytes go to a temporary file in the same folder (a rename is atomic only within one file
     system), reach the disk, and then take the name. The temporary file is removed on any error.
 
     Args:
         path: file to create or replace; its folder must exist.
-        data: the whole new content.
 
     Raises:
         OSError: the folder is missing or cannot be written; ``path`` is then as it was.
@@ -24,7 +29,7 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         with open(temporary, "xb") as file:
-            file.write(data)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -37,3 +42,43 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write ``data`` to ``path`` as a whole or not at all, as `atomic_file` does."""
+    with atomic_file(path) as file:
+        file.write(data)
+
+
+def remove_half_written(folder: str | os.PathLike[str]) -> None:
+    """Remove the temporary files of writers that were killed; there must be no other writer."""
+    for left in Path(folder).glob(".*.tmp"):
+        left.unlink(missing_ok=True)
+
+
+@contextmanager
+def lock(folder: str | os.PathLike[str], *, wait: bool) -> Iterator[None]:
+    """Hold a folder for one process; the lock ends with the process, however that ends.
+
+    Where there are no such locks (not POSIX) nothing is held.
+
+    Args:
+        folder: must exist; a file named .lock is made in it.
+        wait: whether to wait for another process that holds the folder.
+
+    Raises:
+        ValueError: another process holds it, and ``wait`` is False.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with open(Path(folder) / LOCK, "a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError as error:
+            raise ValueError(
+                f"another process works in {folder}; wait until it ends, or give another folder"
+            ) from error
+        yield

@@ -23,23 +23,26 @@ from .her_ddpg import HerDDPG
 from .keywords import check_keywords
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
-from .object_policy import StopWhenSolved, collect_paths, train_object_policy
+from .object_policy import (
+    StopWhenSolved,
+    collect_paths,
+    keeps_object_on_table,
+    train_object_policy,
+)
 from .policies import save_actor
+from .resuming import (
+    FreshEpisodes,
+    begin_new_episodes,
+    env_state,
+    global_generators,
+    set_env_state,
+    set_global_generators,
+)
+from .seeds import stream_seed
 from .sldr import reads_object_networks
 from .wrappers import ImaginedGoalVecEnv
 
 Report = Callable[[str], None]
-
-
-def stream_seed(seed: int, purpose: str) -> int:
-    """Return the seed of one random stream of a run, below 2**31 - 1000.
-
-    Args:
-        seed: the run's seed, >= 0.
-        purpose: any name; different names give unrelated streams.
-    """
-    words = [seed, *purpose.encode()]
-    return int(np.random.SeedSequence(words).generate_state(1)[0]) % (2**31 - 1000)
 
 
 class FollowObject:
@@ -177,17 +180,33 @@ class FollowObject:
         """Take an F_phi that was made before.
 
         Raises:
-            ValueError: it was made for another task or for other physics.
+            ValueError: it was made for another task, for other physics, or from an object that
+                was kept on the table where this one's is not, or the other way round.
         """
         if predictor.env_id != self.env_id or predictor.physics != physics_id(self.env_id):
             raise ValueError(
                 f"the predictor was made for {predictor.env_id} (physics {predictor.physics}), "
                 f"not for {self.env_id} (physics {physics_id(self.env_id)}); make a new one"
             )
+        on_table = self._object_on_table()
+        if predictor.object_on_table not in (None, on_table):
+            raise ValueError(
+                f"the predictor was made with object_on_table={predictor.object_on_table}, "
+                f"not {on_table}; make a new one"
+            )
         self.predictor = predictor
 
-    def learn_object(self) -> tuple[HerDDPG, StopWhenSolved]:
-        """Run stage one (section 4.1): the object policy, and the networks that SLDR needs."""
+    def learn_object(
+        self,
+        callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
+        state: dict[str, Any] | None = None,
+    ) -> tuple[HerDDPG, StopWhenSolved]:
+        """Run stage one (section 4.1): the object policy, and the networks that SLDR needs.
+
+        Args:
+            callback: makes a callback from the one that tests the object's policy.
+            state: of that one; stage one goes on exactly from there.
+        """
         settings = self.settings
         self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
         env, test_env = (self._object_env(name) for name in ("object", "object_test"))
@@ -197,6 +216,8 @@ class FollowObject:
             settings["object_timesteps"],
             seed=stream_seed(self.seed, "object"),
             report=lambda steps, rate: self.report(f"  {steps:>7} steps: success {rate:.2f}"),
+            callback=callback,
+            state=state,
             **settings["object_algorithm"],
         )
         self.object_networks = ObjectNetworks.learned(
@@ -213,10 +234,21 @@ class FollowObject:
         self.object_success = solved.rates[-1] if solved.rates else float("nan")
         return model, solved
 
-    def learn_predictor(self) -> GoalPredictor:
-        """Run stages one and two: object policy, then F_phi (sections 4.1 and 4.2)."""
+    def learn_predictor(
+        self,
+        callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
+        state: dict[str, Any] | None = None,
+        between_epochs: Callable[[], None] = lambda: None,
+    ) -> GoalPredictor:
+        """Run stages one and two: object policy, then F_phi (sections 4.1 and 4.2).
+
+        Args:
+            callback: as in `learn_object`.
+            state: as in `learn_object`.
+            between_epochs: called while F_phi is fitted; may raise to stop.
+        """
         settings = self.settings
-        model, solved = self.learn_object()
+        model, solved = self.learn_object(callback, state)
         env = self._object_env("paths")
         paths = collect_paths(model, env, settings["n_paths"])
         env.close()
@@ -232,7 +264,9 @@ class FollowObject:
             paths.goals,
             env_id=self.env_id,
             physics=physics_id(self.env_id),
+            object_on_table=self._object_on_table(),
             seed=stream_seed(self.seed, "predictor"),
+            progress=lambda epoch, loss: between_epochs(),
             **settings["predictor_fit"],
         )
         self.report(f"  held-out error {float(np.mean(self.predictor.error_mm)):.1f} mm")
@@ -298,6 +332,8 @@ class FollowObject:
         if remaining <= 0:
             return self
         callbacks: list[BaseCallback] = []
+        if env_state(self.env) is None:
+            callbacks.append(FreshEpisodes(lambda n: stream_seed(self.seed, f"robot {n}")))
         if self.curriculum_callback is not None:
             callbacks.append(self.curriculum_callback)
         if isinstance(callback, list):
@@ -332,10 +368,11 @@ class FollowObject:
         }
         if self.model is not None:
             state["model"] = self.model.training_state()
-            state["env"] = _env_state(self.env)
+            state["env"] = env_state(self.env)
+            state["generators"] = global_generators()
             if self.curriculum_callback is not None:
                 state["callback"] = self.curriculum_callback.state_dict()
-                state["test_env"] = _env_state(self.curriculum_callback.test_env)
+                state["test_env"] = env_state(self.curriculum_callback.test_env)
             if replay_buffer:
                 assert self.model.replay_buffer is not None
                 state["replay_buffer"] = self.model.replay_buffer.state_dict()
@@ -350,13 +387,16 @@ class FollowObject:
             return
         model = self.prepare()
         model.load_training_state(state["model"])
-        _set_env_state(self.env, state["env"])
+        set_env_state(self.env, state["env"])
         if self.curriculum_callback is not None:
             self.curriculum_callback.load_state_dict(state["callback"])
-            _set_env_state(self.curriculum_callback.test_env, state["test_env"])
+            set_env_state(self.curriculum_callback.test_env, state["test_env"])
         if "replay_buffer" in state:
             assert model.replay_buffer is not None
             model.replay_buffer.load_state_dict(state["replay_buffer"])
+        if state["env"] is None:
+            begin_new_episodes(model)
+        set_global_generators(state["generators"])
 
     def save(self, folder: str | os.PathLike[str], replay_buffer: bool = True) -> None:
         """Save everything to a folder: settings, predictor and training state.
@@ -384,17 +424,17 @@ class FollowObject:
         folder = Path(folder)
         try:
             settings = json.loads((folder / "settings.json").read_text())
-        except (OSError, ValueError) as error:
+            predictor = None
+            if (folder / "predictor").exists():
+                predictor = GoalPredictor.load(folder / "predictor", env_id=settings["env_id"])
+            networks = None
+            if (folder / OBJECT_FILE).exists():
+                networks = ObjectNetworks.load(folder / OBJECT_FILE, env_id=settings["env_id"])
+            run = cls(**settings, predictor=predictor, object_networks=networks, report=report)
+            run.load_state_dict(load_tree(folder / "state.safetensors"))
+            return run
+        except (OSError, KeyError, RecursionError, TypeError, ValueError) as error:
             raise ValueError(f"{folder} holds no saved FollowObject ({error})") from error
-        predictor = None
-        if (folder / "predictor").exists():
-            predictor = GoalPredictor.load(folder / "predictor", env_id=settings["env_id"])
-        networks = None
-        if (folder / OBJECT_FILE).exists():
-            networks = ObjectNetworks.load(folder / OBJECT_FILE, env_id=settings["env_id"])
-        run = cls(**settings, predictor=predictor, object_networks=networks, report=report)
-        run.load_state_dict(load_tree(folder / "state.safetensors"))
-        return run
 
     def save_policy(self, path: str | os.PathLike[str]) -> None:
         """Save the actor that `predict` uses alone: a small file that `load_actor` reads."""
@@ -409,34 +449,26 @@ class FollowObject:
             self.curriculum_callback.test_env.close()
 
     def _robot_env(self, purpose: str) -> VecEnv:
-        env = make_vec(
-            self.env_id,
-            self.settings["n_envs"],
-            self.settings["n_threads"],
-            reward_type=self.settings["reward_type"],
+        reward_type = self.settings["reward_type"]
+        # Environments of others need not know the word; theirs are sparse unless asked.
+        options = (
+            {}
+            if self.env_id not in IDS and reward_type == "sparse"
+            else {"reward_type": reward_type}
         )
+        env = make_vec(self.env_id, self.settings["n_envs"], self.settings["n_threads"], **options)
         env.seed(stream_seed(self.seed, purpose))
         return env
 
+    def _object_on_table(self) -> bool:
+        return keeps_object_on_table(self.env_id, self.settings["object_on_table"])
+
     def _object_env(self, purpose: str) -> VecEnv:
-        on_table = self.settings["object_on_table"]
-        if on_table is None:
-            on_table = IDS[self.env_id][0].blocked_gripper
         env = make_vec(
             object_id(self.env_id),
             self.settings["object_n_envs"],
             self.settings["n_threads"],
-            on_table=on_table,
+            on_table=self._object_on_table(),
         )
         env.seed(stream_seed(self.seed, purpose))
         return env
-
-
-def _env_state(env: VecEnv) -> Any:
-    """State of an environment that can tell it; others begin new episodes when resumed."""
-    return env.get_state() if hasattr(env, "get_state") else None
-
-
-def _set_env_state(env: VecEnv, state: Any) -> None:
-    if state is not None:
-        env.set_state(state)  # type: ignore[attr-defined]

@@ -45,6 +45,7 @@ class GoalPredictor:
         horizon: T, the largest k.
         env_id: gymnasium id of the task that it was made for.
         physics: short hash of the physics that it was made for.
+        object_on_table: whether the object was kept on the table; None where that is not known.
         error_mm: mean distance to the held-out paths for each k in 1..T, shape (T,), millimetres.
     """
 
@@ -57,11 +58,13 @@ class GoalPredictor:
         env_id: str,
         physics: str,
         error_mm: np.ndarray,
+        object_on_table: bool | None = None,
     ) -> None:
         self.hidden = tuple(hidden)
         self.horizon = horizon
         self.env_id = env_id
         self.physics = physics
+        self.object_on_table = object_on_table
         self.error_mm = error_mm
         self._tensors = tensors
         self._network = _network(self.hidden)
@@ -80,6 +83,7 @@ class GoalPredictor:
         *,
         env_id: str,
         physics: str,
+        object_on_table: bool | None = None,
         hidden: Sequence[int] = (512, 512, 512),
         learning_rate: float = 1e-3,
         batch_size: int = 128,
@@ -98,6 +102,7 @@ class GoalPredictor:
             goals: their goals g, shape (n, 3), metres.
             env_id: gymnasium id of the task, kept with the predictor.
             physics: hash of the task's physics, kept with the predictor.
+            object_on_table: whether the object was kept on the table, kept with the predictor.
             hidden: widths of the hidden layers, each >= 1.
             learning_rate: of Adam, > 0.
             batch_size: samples an update, >= 1.
@@ -144,6 +149,7 @@ class GoalPredictor:
             horizon=horizon,
             env_id=env_id,
             physics=physics,
+            object_on_table=object_on_table,
             error_mm=np.full(horizon, np.nan),
         )
         imagined = predictor.paths(paths[test, 0], goals[test])
@@ -213,6 +219,7 @@ class GoalPredictor:
             "format": FORMAT,
             "env_id": self.env_id,
             "physics": self.physics,
+            "object_on_table": self.object_on_table,
             "horizon": self.horizon,
             "hidden": list(self.hidden),
             "error_mm": self.error_mm.tolist(),
@@ -227,6 +234,7 @@ class GoalPredictor:
         folder: str | os.PathLike[str],
         env_id: str | None = None,
         physics: str | None = None,
+        object_on_table: bool | None = None,
     ) -> GoalPredictor:
         """Read a predictor that ``save`` wrote.
 
@@ -234,10 +242,12 @@ class GoalPredictor:
             folder: holds the two files.
             env_id: the task that it is wanted for; None accepts any.
             physics: the physics that it is wanted for; None accepts any.
+            object_on_table: whether the object should have been kept on the table; None accepts
+                both, and a predictor that does not say is accepted always.
 
         Raises:
             ValueError: a file is missing, damaged or oversized, or the predictor was made for
-                another task or other physics.
+                another task, other physics or another object_on_table.
         """
         folder = Path(folder)
         facts = _checked_facts(folder / FACTS_FILE)
@@ -248,6 +258,12 @@ class GoalPredictor:
                     f"The predictor in {folder} was made for {name} {facts[name]!r}, "
                     f"not for {value!r}: fit one for that task."
                 )
+        made = facts.get("object_on_table")
+        if None not in (made, object_on_table) and made != object_on_table:
+            raise ValueError(
+                f"The predictor in {folder} was made with object_on_table={made}, "
+                f"not {object_on_table}: fit one with that setting."
+            )
         tensors = _checked_tensors(folder / TENSORS_FILE, facts["hidden"], facts["sha256"])
         return cls(
             tensors,
@@ -255,6 +271,7 @@ class GoalPredictor:
             horizon=facts["horizon"],
             env_id=facts["env_id"],
             physics=facts["physics"],
+            object_on_table=made,
             error_mm=np.array(facts["error_mm"], dtype=np.float64),
         )
 
@@ -385,6 +402,8 @@ def _checked_facts(path: Path) -> dict[str, Any]:
     for name in ("env_id", "physics", "sha256"):
         if not isinstance(facts.get(name), str):
             raise ValueError(f"{damaged}: {name} must be a string, got {facts.get(name)!r}.")
+    if not isinstance(facts.get("object_on_table"), bool | None):
+        raise ValueError(f"{damaged}: object_on_table must be true, false or null.")
     horizon, errors = facts.get("horizon"), facts.get("error_mm")
     if type(horizon) is not int or not 1 <= horizon <= HORIZON_LIMIT:
         raise ValueError(f"{damaged}: horizon must lie in 1..{HORIZON_LIMIT}, got {horizon!r}.")

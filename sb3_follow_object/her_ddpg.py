@@ -150,7 +150,7 @@ class HerDDPG(DDPG):
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
+            policy_kwargs=dict(policy_kwargs or {}),  # DDPG writes into it
             verbose=verbose,
             seed=seed,
             device=device,

@@ -148,7 +148,14 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         done: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Store one step of every environment; arguments as in HerReplayBuffer."""
+        """Store one step of every environment; arguments as in HerReplayBuffer.
+
+        An episode whose info says "diverged" at its end is dropped: it is never sampled.
+
+        Raises:
+            ValueError: an environment returned NaN or infinity; nothing of the step is stored.
+        """
+        _check_finite(obs, next_obs, action, reward)
         pos = self.pos
         for row in np.unique(self._row_of_slot[pos]):
             if row >= 0:
@@ -160,7 +167,10 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
             self.original_goals[pos] = [info["original_goal"] for info in infos]
         super(HerReplayBuffer, self).add(obs, next_obs, action, reward, done, infos)
         for env_idx in np.flatnonzero(done):
-            self._compute_episode_length(int(env_idx))
+            if "diverged" in infos[env_idx]:
+                self._current_ep_start[env_idx] = self.pos
+            else:
+                self._compute_episode_length(int(env_idx))
 
     def _forget_episode(self, row: int) -> None:
         """Make an episode that is about to be overwritten invisible to sampling."""
@@ -389,3 +399,18 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
             raise RuntimeError("the replay buffer has no environment: call set_env() after loading")
         infos = infos or [{} for _ in range(len(achieved))]
         return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
+
+
+def _check_finite(
+    obs: dict[str, np.ndarray],
+    next_obs: dict[str, np.ndarray],
+    action: np.ndarray,
+    reward: np.ndarray,
+) -> None:
+    named = {f"the observation {key!r}": value for key, value in obs.items()}
+    named |= {f"the next observation {key!r}": value for key, value in next_obs.items()}
+    for name, array in {**named, "the action": action, "the reward": reward}.items():
+        finite = np.isfinite(array)
+        if not finite.all():
+            index = np.argwhere(~finite)[0, 0]
+            raise ValueError(f"{name} of environment {index} holds NaN or infinity")

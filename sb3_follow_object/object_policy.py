@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
+from .envs import IDS
 from .her_ddpg import HerDDPG
+from .resuming import env_state, global_generators, set_env_state, set_global_generators
 from .rollout import run_episodes
 
 
@@ -58,6 +60,7 @@ class StopWhenSolved(BaseCallback):
         self.report = report
         self.rates: list[float] = []
         self.test_steps = 0
+        self.stopped = False
         self._rollouts = 0
 
     def _on_rollout_end(self) -> None:
@@ -83,7 +86,36 @@ class StopWhenSolved(BaseCallback):
         return len(self.rates) >= 2 and min(self.rates[-2:]) >= self.success_rate
 
     def _on_step(self) -> bool:
-        return not self.solved
+        self.stopped = self.solved
+        return not self.stopped
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the rest of the training depends on, between rollouts."""
+        model = self.model
+        assert isinstance(model, HerDDPG) and model.replay_buffer is not None
+        return {
+            "model": model.training_state(),
+            "replay_buffer": model.replay_buffer.state_dict(),
+            "env": env_state(self.training_env),
+            "test_env": env_state(self.test_env),
+            "generators": global_generators(),
+            "rates": self.rates,
+            "test_steps": self.test_steps,
+            "stopped": self.stopped,
+            "rollouts": self._rollouts,
+        }
+
+    def load_state_dict(self, state: dict[str, Any], model: HerDDPG, env: VecEnv) -> None:
+        """Continue from `state_dict` with an algorithm and an environment like those it had."""
+        assert model.replay_buffer is not None
+        model.load_training_state(state["model"])
+        model.replay_buffer.load_state_dict(state["replay_buffer"])
+        set_env_state(env, state["env"])
+        set_env_state(self.test_env, state["test_env"])
+        set_global_generators(state["generators"])
+        self.rates = list(state["rates"])
+        self.test_steps, self.stopped = state["test_steps"], state["stopped"]
+        self._rollouts = state["rollouts"]
 
 
 def train_object_policy(
@@ -94,6 +126,8 @@ def train_object_policy(
     success_rate: float = 0.98,
     seed: int | None = None,
     report: Callable[[int, float], None] | None = None,
+    callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
+    state: dict[str, Any] | None = None,
     **algorithm_kwargs: Any,
 ) -> tuple[HerDDPG, StopWhenSolved]:
     """Learn the object policy nu by DDPG + HER and stop as soon as it solves the task.
@@ -105,15 +139,35 @@ def train_object_policy(
         success_rate: noise-free success that counts as solved, in two tests in a row.
         seed: of networks, noise and replay.
         report: called with (env_steps, success rate) after each test.
+        callback: makes another callback from the one that tests.
+        state: of `StopWhenSolved.state_dict`; training goes on exactly from there.
         algorithm_kwargs: of HerDDPG.
 
     Returns:
         The algorithm and the callback that knows the test results.
     """
-    callback = StopWhenSolved(test_env, success_rate=success_rate, report=report)
+    solved = StopWhenSolved(test_env, success_rate=success_rate, report=report)
     model = HerDDPG("MultiInputPolicy", env, seed=seed, **algorithm_kwargs)
-    model.learn(total_timesteps, callback=callback, log_interval=None)  # type: ignore[arg-type]
-    return model, callback
+    if state is not None:
+        solved.load_state_dict(state, model, env)
+    if not solved.stopped:
+        model.learn(
+            total_timesteps - model.num_timesteps,
+            callback=CallbackList([solved, *([callback(solved)] if callback else [])]),
+            log_interval=None,  # type: ignore[arg-type]
+            reset_num_timesteps=state is None,
+        )
+    return model, solved
+
+
+def keeps_object_on_table(env_id: str, setting: bool | None = None) -> bool:
+    """Whether the object may not leave the table in the first stage.
+
+    Args:
+        env_id: a task of this package.
+        setting: None decides by the task: yes where the gripper is blocked (Push tasks).
+    """
+    return IDS[env_id][0].blocked_gripper if setting is None else setting
 
 
 def collect_paths(model: Any, env: VecEnv, n_episodes: int) -> ObjectPaths:
@@ -133,8 +187,9 @@ def collect_paths(model: Any, env: VecEnv, n_episodes: int) -> ObjectPaths:
             current.append(obs["achieved_goal"].copy())
         current.append(next_obs["achieved_goal"].copy())
         if dones.all():
-            paths.append(np.stack(current, axis=1))
-            goals.append(obs["desired_goal"].copy())
+            good = ["diverged" not in info for info in infos]
+            paths.append(np.stack(current, axis=1)[good])
+            goals.append(obs["desired_goal"][good])
             current.clear()
         elif dones.any():
             raise ValueError("the object's episodes differ in length; F_phi needs a fixed horizon")

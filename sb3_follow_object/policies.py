@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+from itertools import pairwise
 from typing import Any
 
 import torch as th
@@ -165,11 +166,25 @@ def load_actor(
     saved = load_tree(path)
     try:
         extractor = NormalizedGoalExtractor(observation_space)
+        widths = [extractor.features_dim, *saved["net_arch"], *action_space.shape]
+        _check_layers(saved["actor"], widths)  # before anything of their size is allocated
         actor = Actor(
             observation_space, action_space, saved["net_arch"], extractor, extractor.features_dim
         )
         actor.load_state_dict(saved["actor"])
         actor.set_training_mode(False)
         return actor, str(saved["env_id"])
-    except (KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"{path} is not a policy for this environment ({error})") from error
+    except (AttributeError, KeyError, TypeError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path} is not a policy for this environment ({reason})") from error
+
+
+def _check_layers(tensors: dict[str, th.Tensor], widths: list[int]) -> None:
+    """Raise a ValueError unless the tensors are finite and those of layers with these widths."""
+    if not all(bool(th.isfinite(value).all()) for value in tensors.values()):
+        raise ValueError("it holds NaN or infinity")
+    for layer, (n_in, n_out) in enumerate(pairwise(widths)):
+        # An activation stands between two linear layers, so these have the even places.
+        shape = tuple(tensors[f"mu.{2 * layer}.weight"].shape)
+        if shape != (n_out, n_in):
+            raise ValueError(f"layer {layer} has the shape {shape}, not {(n_out, n_in)}")

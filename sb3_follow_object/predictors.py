@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from .config import run_config
 from .envs import physics_id
-from .experiment import RunConfig
+from .files import lock
 from .follow_object import FollowObject, Report
 from .goal_predictor import FACTS_FILE, GoalPredictor
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
+from .object_policy import keeps_object_on_table
+from .run_folder import RunConfig
 
 CACHE_VARIABLE = "SB3_FOLLOW_OBJECT_CACHE"
 
@@ -31,11 +31,13 @@ def get_predictor(
         report: called with a sentence now and then while it is learned, which takes minutes.
 
     Raises:
-        ValueError: the folder holds a predictor for another task or other physics, or a damaged
-            one; or the id is not of this package.
+        ValueError: the folder holds a predictor for another task, other physics or another
+            object_on_table, or a damaged one; or the id is not of this package.
     """
     path = _kept(FACTS_FILE, env_id, folder, report)
-    return GoalPredictor.load(path.parent, env_id=env_id, physics=physics_id(env_id))
+    on_table = keeps_object_on_table(env_id)
+    physics = physics_id(env_id)
+    return GoalPredictor.load(path.parent, env_id=env_id, physics=physics, object_on_table=on_table)
 
 
 def get_object_networks(
@@ -49,7 +51,8 @@ def get_object_networks(
 def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report: Report) -> Path:
     """Return a file of a task's first two stages, which run unless it is there already."""
     path = cache_folder() / env_id / physics_id(env_id) if folder is None else Path(folder)
-    with _lock(path):
+    path.mkdir(parents=True, exist_ok=True)
+    with lock(path, wait=True):  # those of a SubprocVecEnv come together
         if not (path / name).exists():
             learn_predictor(run_config(env_id), path, report)
     return path / name
@@ -83,17 +86,3 @@ def cache_folder() -> Path:
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "sb3_follow_object"
-
-
-@contextmanager
-def _lock(folder: Path) -> Iterator[None]:
-    """Let one process at a time look for a predictor: those of a SubprocVecEnv come together."""
-    try:
-        import fcntl
-    except ImportError:  # not POSIX: two may then learn the same predictor
-        yield
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / ".lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # ends with the process, however that ends
-        yield

@@ -63,7 +63,7 @@ def run_episodes(
     """Run `n_episodes` fresh episodes and say how they ended.
 
     Each copy contributes the same number of episodes (to within one), so that quick failures are
-    not over-represented.
+    not over-represented. Episodes whose info says "diverged" at the end are not counted.
 
     Args:
         policy: maps observations, arrays of (n_envs, ...), to actions (n_envs, action_dim).
@@ -74,6 +74,7 @@ def run_episodes(
 
     Raises:
         ValueError: if `n_episodes` is below 1 or an episode ends without saying `is_success`.
+        RuntimeError: more than `n_episodes` episodes diverged.
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes is {n_episodes}; it must be at least 1")
@@ -82,7 +83,7 @@ def run_episodes(
     finished = np.zeros(n_envs, dtype=int)
     returns_so_far = np.zeros(n_envs)
     success, original_success, returns = [], [], []
-    env_steps = 0
+    env_steps = n_diverged = 0
 
     obs = venv.reset()
     while (finished < wanted).any():
@@ -94,7 +95,14 @@ def run_episodes(
             next_obs = with_terminal_observations(new_obs, dones, infos)  # type: ignore[arg-type]
             on_step(obs, actions, rewards, dones, infos, next_obs)  # type: ignore[arg-type]
         for i in np.flatnonzero(dones):
-            if finished[i] < wanted[i]:
+            if "diverged" in infos[i]:
+                n_diverged += 1
+                if n_diverged > n_episodes:
+                    raise RuntimeError(
+                        f"the physics diverged in {n_diverged} episodes of {n_episodes} wanted "
+                        f"(the last: {infos[i]['diverged']})"
+                    )
+            elif finished[i] < wanted[i]:
                 if "is_success" not in infos[i]:
                     raise ValueError(
                         "the environment's info has no 'is_success' at the end of an episode; "

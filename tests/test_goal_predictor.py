@@ -160,6 +160,15 @@ def edit_tensors(folder: Path, **changes: torch.Tensor) -> None:
     edit_facts(folder, sha256=hashlib.sha256(data).hexdigest())
 
 
+def test_a_predictor_of_an_object_moved_otherwise_is_refused(tmp_path: Path) -> None:
+    made = GoalPredictor.fit(*toy.paths(8), **{**SMALL, "hidden": (4,)}, object_on_table=True)
+    made.save(tmp_path)
+    assert GoalPredictor.load(tmp_path, object_on_table=True).object_on_table is True
+    assert GoalPredictor.load(tmp_path).object_on_table is True
+    with pytest.raises(ValueError, match=r"made with object_on_table=True, not False"):
+        GoalPredictor.load(tmp_path, object_on_table=False)
+
+
 @pytest.mark.parametrize(
     "change",
     [
