@@ -157,6 +157,7 @@ def test_predictor_of_another_task_is_refused(
         get_predictor(other, tmp_path / "predictor")
     config = json.loads((finished / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps({**config, "env_id": other}))
+    shutil.copy(finished / "object_stage.json", tmp_path)
     err = refusal(capsys, "train", "--run", tmp_path, "--resume")
     assert f"was made for env_id '{TASK}', not for '{other}'" in err
 
@@ -180,7 +181,10 @@ def test_predictor_of_another_task_is_refused(
         (["--env", TASK, "--set", "object_algorithm.random_action_prob=2"], "random_action_prob"),
         (["--env", TASK, "--config", "none.yml"], "none.yml cannot be read"),
         (["--env", TASK, "--resume"], "holds no run"),
-        (["--env", TASK, "--method", "rnd", "--set", "auxiliary.hidden=[0]"], "must be >= 1"),
+        (
+            ["--env", TASK, "--method", "rnd", "--set", "auxiliary.hidden=[0]"],
+            "hidden must be 1 to 16 whole numbers",
+        ),
         (["--env", TASK, "--method", "rnd", "--set", "auxiliary.name=rdn"], "did you mean 'rnd'"),
         (["--env", TASK, "--method", "sldr", "--set", "auxiliary.hidden=[8]"], "'hidden'"),
         (["--env", TASK, "--method", "cher", "--set", "replay_buffer_kwargs.cher.picks=0"], ">= 1"),
