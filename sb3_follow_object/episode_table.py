@@ -6,66 +6,92 @@ from typing import Any
 
 import numpy as np
 
+_BUCKETS = 2  # for each episode: most points then need no search, and the guide is small
+
 
 class EpisodeTable:
     """The finished episodes of the buffer: where each starts and how long it is.
 
-    Sampling draws from this table, never from the slots, so its cost depends on the number of
-    episodes only through a binary search.
+    Sampling draws from this table, never from the slots, and finds the episode of a drawn number by
+    looking it up in equal buckets, so its cost hardly depends on how many episodes there are.
     """
 
-    _ARRAYS = ("start", "env", "length", "priority")
-
     def __init__(self) -> None:
-        self.start = np.zeros(64, dtype=np.int64)
-        self.env = np.zeros(64, dtype=np.int64)
-        self.length = np.zeros(64, dtype=np.int64)
+        # Start, environment, length and nothing: what is read together lies together.
+        self.facts = np.zeros((64, 4), dtype=np.int32)
         self.priority = np.zeros(64)  # 0: drawn with all episodes only
         self._free = list(range(63, -1, -1))
-        self._draw_lists: dict[bool, tuple[np.ndarray, np.ndarray]] = {}
+        self._row_of: dict[tuple[int, int], int] = {}
+        self._draw_lists: dict[bool, _DrawList] = {}
+
+    @property
+    def start(self) -> np.ndarray:
+        """First slot of each row's episode."""
+        return self.facts[:, 0]
+
+    @property
+    def env(self) -> np.ndarray:
+        """Environment of each row's episode."""
+        return self.facts[:, 1]
+
+    @property
+    def length(self) -> np.ndarray:
+        """Steps of each row's episode, 0 where the row holds none."""
+        return self.facts[:, 2]
 
     def insert(self, start: int, env: int, length: int, priority: float) -> int:
         """Add an episode and return its row."""
         if not self._free:
-            n = len(self.length)
-            for name in self._ARRAYS:
-                array = getattr(self, name)
-                setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
+            n = len(self.facts)
+            self.facts = np.concatenate([self.facts, np.zeros_like(self.facts)])
+            self.priority = np.concatenate([self.priority, np.zeros_like(self.priority)])
             self._free = list(range(2 * n - 1, n - 1, -1))
         row = self._free.pop()
-        self.start[row], self.env[row] = start, env
-        self.length[row], self.priority[row] = length, priority
+        self.facts[row, :3] = start, env, length
+        self.priority[row] = priority
+        self._row_of[start, env] = row
         self._draw_lists.clear()
         return row
 
+    def row_of(self, start: int, env: int) -> int:
+        """Row of the episode of an environment that starts in a slot."""
+        return self._row_of[start, env]
+
     def remove(self, row: int) -> None:
         """Forget the episode in `row`."""
-        self.length[row] = 0
+        del self._row_of[int(self.start[row]), int(self.env[row])]
+        self.facts[row, 2] = 0
         self._free.append(row)
         self._draw_lists.clear()
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next draws depend on."""
-        return {**{name: getattr(self, name) for name in self._ARRAYS}, "free": self._free}
+        return {"facts": self.facts, "priority": self.priority, "free": self._free}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        for name in self._ARRAYS:
-            setattr(self, name, state[name].copy())
+        self.facts, self.priority = state["facts"].copy(), state["priority"].copy()
         self._free = list(state["free"])
+        self._row_of = {
+            (start, env): row
+            for row, (start, env, length, _) in enumerate(self.facts.tolist())
+            if length
+        }
         self._draw_lists.clear()
 
-    def _draw_list(self, by_priority: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Rows to draw from and the running sum of their weights."""
+    def draw_list(self, by_priority: bool = False) -> _DrawList:
+        """All episodes, or those with a priority, as `draw` draws from them."""
         if by_priority not in self._draw_lists:
-            weight = self.length * self.priority if by_priority else self.length
+            length = self.length.astype(np.float64)
+            weight = length * self.priority if by_priority else length
             rows = np.flatnonzero(weight > 0)
-            self._draw_lists[by_priority] = rows, np.cumsum(weight[rows])
+            total = int(length[rows].sum())
+            self._draw_lists[by_priority] = _DrawList(rows, np.cumsum(weight[rows]), total)
         return self._draw_lists[by_priority]
 
     def n_transitions(self, with_priority: bool = False) -> int:
         """Transitions in finished episodes, or in those with a priority."""
-        return int(self.length[self._draw_list(with_priority)[0]].sum())
+        return self.draw_list(with_priority).n_transitions
 
     def draw(
         self, n: int, rng: np.random.Generator, by_priority: bool = False
@@ -74,7 +100,47 @@ class EpisodeTable:
 
         Uniformly over transitions, or episodes in proportion to length times priority.
         """
-        rows, ends = self._draw_list(by_priority)
-        which = np.searchsorted(ends, rng.random(n) * ends[-1], side="right")
-        row = rows[np.minimum(which, len(rows) - 1)]
-        return row, rng.integers(self.length[row])
+        episodes = self.draw_list(by_priority)
+        row = episodes.at(rng.random(n) * episodes.ends[-1])
+        return row, rng.integers(self.facts.take(row, axis=0)[:, 2])
+
+
+class _DrawList:
+    """Episodes side by side on a line, each as long as its weight.
+
+    Args:
+        rows: of the table, (m,).
+        ends: where each ends, (m,), the running sum of the weights.
+        n_transitions: in all of them.
+    """
+
+    def __init__(self, rows: np.ndarray, ends: np.ndarray, n_transitions: int) -> None:
+        self.rows = rows.astype(np.int32)
+        self.ends = ends
+        self.n_transitions = n_transitions
+        self._guide: np.ndarray | None = None
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """Rows of the episodes (n,) at points (n,) of the line: those of a binary search."""
+        if self._guide is None:
+            self._guide = self._make_guide()
+        found = self._guide.take(self._bucket(points), mode="clip")
+        found += points >= self.ends.take(found)
+        wrong = np.flatnonzero(points >= self.ends.take(found, mode="clip"))
+        if len(wrong):
+            found[wrong] = np.searchsorted(self.ends, points[wrong], side="right")
+        return self.rows.take(found, mode="clip")  # a point rounded up to the end is in the last
+
+    def _bucket(self, points: np.ndarray) -> np.ndarray:
+        return (points * (_BUCKETS * len(self.ends) / self.ends[-1])).astype(np.int64)
+
+    def _make_guide(self) -> np.ndarray:
+        """First episode (int32) that a point of each bucket can lie in.
+
+        Rounding changes no order, so an episode whose end is in an earlier bucket than a point ends
+        before the point: the guide is never too far.
+        """
+        n_buckets = _BUCKETS * len(self.ends)
+        n_ends = np.bincount(self._bucket(self.ends), minlength=n_buckets + 1)[:n_buckets]
+        guide = np.minimum(np.cumsum(n_ends) - n_ends, len(self.ends) - 1)
+        return guide.astype(np.int32)  # half the memory, so that it stays in the cache

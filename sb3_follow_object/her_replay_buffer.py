@@ -17,6 +17,7 @@ from .cher import GoalSelection
 from .episode_table import EpisodeTable
 from .imagination import imagine
 from .keywords import check_keywords
+from .record_buffer import NEXT_DESIRED, RecordReplayBuffer
 from .wrappers import imagination_of
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
@@ -24,7 +25,7 @@ GRAVITY = 9.81  # m/s^2
 IMAGINED_RATIO = "imagined_ratio > 0"  # what needs an environment that imagines goals
 
 
-class FollowObjectReplayBuffer(HerReplayBuffer):
+class FollowObjectReplayBuffer(RecordReplayBuffer):
     """SB3's HerReplayBuffer with imagined goals, moved-object sampling and float32 storage.
 
     Takes the place of `HerReplayBuffer` in any off-policy algorithm of SB3.
@@ -125,19 +126,15 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
             imagination_of(env, IMAGINED_RATIO)  # raises now rather than at the first sample
         self.rng = np.random.default_rng(np.random.randint(2**31) if seed is None else seed)
 
-        # Physics in float64 is needed while stepping, not while learning.
-        for store in (self.observations, self.next_observations):
-            for key, array in store.items():
-                if array.dtype == np.float64:
-                    store[key] = np.zeros(array.shape, dtype=np.float32)
         goal_shape = self.observations["desired_goal"].shape
         self.original_goals = np.zeros(
             goal_shape if imagined_ratio > 0.0 else (0,), dtype=np.float32
         )
         if not copy_info_dict:
             self.infos = np.empty((0, n_envs), dtype=object)  # one unused dict a slot otherwise
+        # Whether what a slot achieved is far enough from where its episode began.
+        self._far = np.zeros(self.dones.shape if min_goal_distance > 0.0 else (0,), dtype=bool)
         self.table = EpisodeTable()
-        self._row_of_slot = np.full((self.buffer_size, n_envs), -1, dtype=np.int32)
 
     def add(  # type: ignore[override]
         self,
@@ -157,9 +154,13 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         """
         _check_finite(obs, next_obs, action, reward)
         pos = self.pos
-        for row in np.unique(self._row_of_slot[pos]):
-            if row >= 0:
-                self._forget_episode(int(row))
+        rows = [
+            self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
+            for env_idx in np.flatnonzero(self.ep_length[pos])
+        ]
+        for row in sorted(rows):
+            self._forget_episode(row)
+        self._make_room_for(obs, next_obs)
         self.ep_start[pos] = self._current_ep_start
         if self.copy_info_dict:
             self.infos[pos] = infos
@@ -177,7 +178,6 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         env_idx = self.table.env[row]
         slots = (self.table.start[row] + np.arange(self.table.length[row])) % self.buffer_size
         self.ep_length[slots, env_idx] = 0
-        self._row_of_slot[slots, env_idx] = -1
         self.table.remove(row)
 
     def _compute_episode_length(self, env_idx: int) -> None:
@@ -189,8 +189,10 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         self.ep_length[slots, env_idx] = length
         origin = self.observations["achieved_goal"][start, env_idx]
         path = self.next_observations["achieved_goal"][slots, env_idx]
-        row = self.table.insert(start, env_idx, length, self._priority(origin, path))
-        self._row_of_slot[slots, env_idx] = row
+        if self.min_goal_distance > 0.0:
+            distance = np.linalg.norm(path - origin, axis=1)
+            self._far[slots, env_idx] = distance >= self.min_goal_distance
+        self.table.insert(start, env_idx, length, self._priority(origin, path))
 
     def _priority(self, origin: np.ndarray, path: np.ndarray) -> float:
         """Priority of an episode from where the achieved goal began (d,) and went (length, d)."""
@@ -223,7 +225,9 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         Raises:
             ValueError: the state belongs to a buffer with other stores or shapes.
         """
-        stores, slots = self._stores(), state["slots"]
+        slots = state["slots"]
+        self._share_goals(NEXT_DESIRED not in slots)
+        stores = self._stores()
         if set(stores) != set(slots) or any(
             len(slots[name]) > len(store) or slots[name].shape[1:] != store.shape[1:]
             for name, store in stores.items()
@@ -239,14 +243,11 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
             self.selection.load_state_dict(state["selection"])
 
     def _stores(self) -> dict[str, np.ndarray]:
-        """Every array with one entry a slot."""
-        stores = {f"observations.{key}": value for key, value in self.observations.items()}
-        stores |= {f"next_observations.{key}": v for key, v in self.next_observations.items()}
-        for name in ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length"):
-            stores[name] = getattr(self, name)
-        stores["row_of_slot"] = self._row_of_slot
+        stores = super()._stores()
         if self.imagined_ratio > 0.0:
             stores["original_goals"] = self.original_goals
+        if self.min_goal_distance > 0.0:
+            stores["far"] = self._far
         return stores
 
     def moved_share(self) -> float:
@@ -296,48 +297,48 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
         if self.selection is not None:
             batch_size *= self.selection.candidates
         row, step = self._draw(batch_size)
-        env_idx, start = self.table.env[row], self.table.start[row]
-        slot = (start + step) % self.buffer_size
-        flat = slot * self.n_envs + env_idx
-
-        obs = {key: self._take(store, flat) for key, store in self.observations.items()}
-        next_obs = {key: self._take(store, flat) for key, store in self.next_observations.items()}
-        rewards = self._take(self.rewards, flat)
-
-        steps_to_goal = np.full(batch_size, np.inf)
+        episode = self.table.facts.take(row, axis=0)
+        flat = self._flat(episode, step)
+        achieved = self._achieved_goals(flat)
+        steps_to_goal = np.full(batch_size, np.inf, dtype=np.float32)
         virtual = np.flatnonzero(self.rng.random(batch_size) < self.her_ratio)
-        if len(virtual):
-            goals, steps = self._hindsight_goals(row[virtual], step[virtual])
-            if self.min_goal_distance > 0.0:
-                far = np.linalg.norm(goals - self._origin(row[virtual]), axis=1)
-                kept = far >= self.min_goal_distance
-                virtual, goals, steps = virtual[kept], goals[kept], steps[kept]
-            if self.imagined_ratio > 0.0:
-                chosen = np.flatnonzero(self.rng.random(len(virtual)) < self.imagined_ratio)
-                goals[chosen] = self._imagined_goals(row[virtual[chosen]])
-                steps[chosen] = np.inf
-            steps_to_goal[virtual] = steps
-            obs["desired_goal"][virtual] = goals
-            next_obs["desired_goal"][virtual] = goals
-            infos = list(self.infos[slot, env_idx][virtual]) if self.copy_info_dict else []
-            rewards[virtual] = self._reward(next_obs["achieved_goal"][virtual], goals, infos)
+        relabelled = episode.take(virtual, axis=0)
+        goals, steps, far = self._hindsight_goals(relabelled, step.take(virtual))
+        if far is not None:
+            kept = np.flatnonzero(far)
+            virtual, steps = virtual.take(kept), steps.take(kept)
+            goals = goals.take(kept, axis=0)
+        if self.imagined_ratio > 0.0:
+            chosen = np.flatnonzero(self.rng.random(len(virtual)) < self.imagined_ratio)
+            goals[chosen] = self._imagined_goals(episode[virtual[chosen]])
+            steps[chosen] = np.inf
+        steps_to_goal[virtual] = steps
+        rewards = self._reward(achieved.take(virtual, axis=0), goals, flat.take(virtual))
+        # Last, as it drives all else out of the cache.
+        batch = self._gather(flat, achieved)
+        batch.rewards[virtual] = rewards
+        for desired in batch.desired_goals():
+            desired[virtual] = goals
 
         if self.selection is not None:
             chosen = self.selection.choose(
-                obs["desired_goal"], obs["achieved_goal"], n_batches, self.rng
+                batch.observations["desired_goal"],
+                batch.observations["achieved_goal"],
+                n_batches,
+                self.rng,
             )
-            flat, rewards, steps_to_goal = flat[chosen], rewards[chosen], steps_to_goal[chosen]
-            obs = {key: value[chosen] for key, value in obs.items()}
-            next_obs = {key: value[chosen] for key, value in next_obs.items()}
-        dones = self._take(self.dones, flat) * (1.0 - self._take(self.timeouts, flat))
-        obs = self._normalize_obs(obs, env)  # type: ignore[assignment]
-        next_obs = self._normalize_obs(next_obs, env)  # type: ignore[assignment]
-        rewards = self._normalize_reward(rewards, env)
+            batch, steps_to_goal = batch.pick(chosen), steps_to_goal[chosen]
+        obs, next_obs = (
+            self._normalize_obs(observations, env)
+            for observations in (batch.observations, batch.next_observations)
+        )
+        assert isinstance(obs, dict) and isinstance(next_obs, dict)
+        rewards = self._normalize_reward(batch.rewards, env)
         samples = DictReplayBufferSamples(
             observations={key: self._to_tensor(value) for key, value in obs.items()},
-            actions=self._to_tensor(self._take(self.actions, flat)),
+            actions=self._to_tensor(batch.actions),
             next_observations={key: self._to_tensor(value) for key, value in next_obs.items()},
-            dones=self._to_tensor(dones).reshape(-1, 1),
+            dones=self._to_tensor(batch.dones).reshape(-1, 1),
             rewards=self._to_tensor(rewards).reshape(-1, 1),
         )
         return samples, self._to_tensor(steps_to_goal).reshape(-1, 1)
@@ -349,55 +350,55 @@ class FollowObjectReplayBuffer(HerReplayBuffer):
             row[chosen], step[chosen] = self.table.draw(len(chosen), self.rng, by_priority=True)
         return row, step
 
-    def _take(self, store: np.ndarray, flat: np.ndarray) -> np.ndarray:
-        """Copy of the (slot, environment) entries with the given flat indices."""
-        return store.reshape(self.buffer_size * self.n_envs, *store.shape[2:]).take(flat, axis=0)
+    def _flat(self, episode: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Indices slot * n_envs + environment (n,) of steps of episodes, facts (n, 4)."""
+        slot = episode[:, 0] + step
+        slot -= self.buffer_size * (slot >= self.buffer_size)
+        return slot * self.n_envs + episode[:, 1]
 
     def _to_tensor(self, array: np.ndarray) -> th.Tensor:
-        return th.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.device)
+        return th.from_numpy(np.asarray(array, dtype=np.float32)).to(self.device)
 
-    def _hindsight_goals(self, row: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _hindsight_goals(
+        self, episode: np.ndarray, step: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Achieved goals of the same episode, by the goal selection strategy (n, d).
 
         Second, the steps from the transition to the one that achieved the goal (n,), float;
-        infinite for goals of the past.
+        infinite for goals of the past. Third, if that matters, whether the goal lies far enough
+        from where the episode began (n,).
         """
-        length = self.table.length[row]
+        length = episode[:, 2]
         if self.goal_selection_strategy == GoalSelectionStrategy.FINAL:
             chosen = length - 1
         elif self.goal_selection_strategy == GoalSelectionStrategy.FUTURE:
             chosen = self.rng.integers(step, length)
         else:
             chosen = self.rng.integers(0, length)
-        slot = (self.table.start[row] + chosen) % self.buffer_size
-        goals = self._take(
-            self.next_observations["achieved_goal"], slot * self.n_envs + self.table.env[row]
-        )
-        return goals, np.where(chosen >= step, chosen - step, np.inf)
+        flat = self._flat(episode, chosen)
+        steps = np.where(chosen >= step, chosen - step, np.float32(np.inf))
+        far = self._take(self._far, flat) if self.min_goal_distance > 0.0 else None
+        return self._achieved_goals(flat), steps, far
 
-    def _origin(self, row: np.ndarray) -> np.ndarray:
-        """Achieved goals that the episodes began with (n, d)."""
-        flat = self.table.start[row] * self.n_envs + self.table.env[row]
-        return self._take(self.observations["achieved_goal"], flat)
-
-    def _imagined_goals(self, row: np.ndarray) -> np.ndarray:
+    def _imagined_goals(self, episode: np.ndarray) -> np.ndarray:
         """F_phi(o_1, g, k) of each episode at a level drawn from 1..k_max (n, d)."""
         predictor, curriculum = imagination_of(self.env, IMAGINED_RATIO)
-        start = self._origin(row)
-        goal = self._take(
-            self.original_goals, self.table.start[row] * self.n_envs + self.table.env[row]
-        )
-        level = self.rng.integers(1, curriculum.k_max, size=len(row), endpoint=True)
+        first = episode[:, 0], episode[:, 1]
+        start = self.observations["achieved_goal"][first]
+        goal = self.original_goals[first]
+        level = self.rng.integers(1, curriculum.k_max, size=len(episode), endpoint=True)
         return imagine(predictor, curriculum, start, goal, level)
 
-    def _reward(
-        self, achieved: np.ndarray, desired: np.ndarray, infos: list[dict[str, Any]]
-    ) -> np.ndarray:
+    def _reward(self, achieved: np.ndarray, desired: np.ndarray, flat: np.ndarray) -> np.ndarray:
+        """Rewards (n,) of goals achieved for goals desired (n, d) in the transitions `flat`."""
+        if not len(flat):
+            return np.zeros(0, dtype=np.float32)
+        # Where no infos are kept, one empty dict does for all.
+        infos = list(self._take(self.infos, flat)) if self.copy_info_dict else [{}] * len(flat)
         if self.reward_function is not None:
             return self.reward_function(achieved, desired, infos)
         if self.env is None:
             raise RuntimeError("the replay buffer has no environment: call set_env() after loading")
-        infos = infos or [{} for _ in range(len(achieved))]
         return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
 
 

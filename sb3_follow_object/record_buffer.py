@@ -1,0 +1,179 @@
+"""SB3's replay buffer with the fields of a transition side by side in memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from .records import Records
+
+_HALVES = ("observations", "next_observations")
+_DESIRED, NEXT_DESIRED = "observations.desired_goal", "next_observations.desired_goal"
+_ACHIEVED = "next_observations.achieved_goal"
+
+
+@dataclass
+class Gathered:
+    """Copies of n stored transitions; the arrays may be views of one another.
+
+    Attributes:
+        observations, next_observations: key -> (n, ...).
+        actions: (n, action_dim).
+        rewards: (n,).
+        dones: (n,), 1 where the episode terminated, 0 where it went on or was truncated.
+    """
+
+    observations: dict[str, np.ndarray]
+    next_observations: dict[str, np.ndarray]
+    actions: np.ndarray
+    rewards: np.ndarray
+    dones: np.ndarray
+
+    def desired_goals(self) -> list[np.ndarray]:
+        """Return the desired goals of both, once where they are the same array."""
+        here, there = (o["desired_goal"] for o in (self.observations, self.next_observations))
+        return [here] if there is here else [here, there]
+
+    def pick(self, rows: np.ndarray) -> Gathered:
+        """Return some of them, in this order."""
+        return Gathered(
+            {key: value[rows] for key, value in self.observations.items()},
+            {key: value[rows] for key, value in self.next_observations.items()},
+            self.actions[rows],
+            self.rewards[rows],
+            self.dones[rows],
+        )
+
+
+class RecordReplayBuffer(HerReplayBuffer):
+    """HerReplayBuffer whose arrays are views of float32 records; see `Records`.
+
+    Physics in float64 is needed while stepping, not while learning. Images and what is not float
+    stay in arrays of their own. Achieved goals are read twice, with a transition and as hindsight
+    goals, so those of next observations are records by themselves: they fit into the cache. The
+    desired goals of next observations are stored apart only once they differ from the others.
+
+    The arguments are HerReplayBuffer's.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        fields: dict[str, tuple[int, ...]] = {}
+        for half in _HALVES:
+            store = getattr(self, half)
+            for key, array in store.items():
+                if array.dtype == np.float64:
+                    store[key] = np.zeros(array.shape, dtype=np.float32)
+                if store[key].dtype == np.float32 and array.ndim == 3:
+                    fields[f"{half}.{key}"] = array.shape[2:]
+        if self.actions.dtype == np.float32:
+            fields["actions"] = self.actions.shape[2:]
+        fields |= {"rewards": (), "dones": (), "timeouts": ()}
+        self._goals_are_shared = fields.pop(NEXT_DESIRED, None) is not None
+        goal = fields.pop(_ACHIEVED, None)
+        self.records = Records(self.buffer_size, self.n_envs, fields)
+        # Three coordinates and an empty place are read in half the time of three.
+        self.achieved = (
+            None
+            if goal is None
+            else Records(self.buffer_size, self.n_envs, {_ACHIEVED: goal}, block=4, spare=0.34)
+        )
+        for name in ("ep_start", "ep_length"):  # half of SB3's bytes
+            setattr(self, name, np.zeros((self.buffer_size, self.n_envs), dtype=np.int32))
+        self._connect()
+
+    def _views(self) -> dict[str, np.ndarray]:
+        """Every array of SB3's that is a view, by its name."""
+        views = self.records.views()
+        if self.achieved is not None:
+            views |= self.achieved.views()
+        if self._goals_are_shared:
+            views[NEXT_DESIRED] = views[_DESIRED]
+        return views
+
+    def _connect(self) -> None:
+        """Let SB3's arrays be views of the records."""
+        for name, view in self._views().items():
+            half, _, key = name.partition(".")
+            if key:
+                getattr(self, half)[key] = view
+            else:
+                setattr(self, name, view)
+
+    def _share_goals(self, shared: bool) -> None:
+        """Store desired goals of observations and next observations once, or twice."""
+        self._goals_are_shared = shared
+        goals = self.observations["desired_goal"]
+        self.next_observations["desired_goal"] = goals if shared else goals.copy()
+
+    def _make_room_for(self, obs: dict[str, np.ndarray], next_obs: dict[str, np.ndarray]) -> None:
+        """Store desired goals twice from now on if those of a step differ."""
+        if self._goals_are_shared and not np.array_equal(
+            obs["desired_goal"], next_obs["desired_goal"]
+        ):
+            self._share_goals(False)
+
+    def _stores(self) -> dict[str, np.ndarray]:
+        """Every array with one entry a slot, none of them a view of another."""
+        stores = {"records": self.records.array}
+        if self.achieved is not None:
+            stores["achieved"] = self.achieved.array
+        views = self._views()
+        for half in _HALVES:
+            for key, array in getattr(self, half).items():
+                stores[f"{half}.{key}"] = array
+        for name in ("actions", "ep_start", "ep_length"):
+            stores[name] = getattr(self, name)
+        return {name: store for name, store in stores.items() if name not in views}
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        views = self._views()
+        for half in _HALVES:
+            state[half] = {
+                key: None if f"{half}.{key}" in views else array
+                for key, array in state[half].items()
+            }
+        return {name: value for name, value in state.items() if name not in views}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._connect()
+
+    def _gather(self, flat: np.ndarray, achieved: np.ndarray) -> Gathered:
+        """Copy the transitions with indices slot * n_envs + environment (n,).
+
+        What they achieved (n, d) has been copied already.
+        """
+        batch = self.records.fields(self.records.take(flat))
+        batch[_ACHIEVED] = achieved
+        if self._goals_are_shared:
+            batch[NEXT_DESIRED] = batch[_DESIRED]
+
+        def field(name: str, store: np.ndarray) -> np.ndarray:
+            return batch[name] if name in batch else self._take(store, flat)
+
+        obs, next_obs = (
+            {key: field(f"{half}.{key}", store) for key, store in getattr(self, half).items()}
+            for half in _HALVES
+        )
+        return Gathered(
+            obs,
+            next_obs,
+            field("actions", self.actions),
+            batch["rewards"].copy(),
+            batch["dones"] * (1.0 - batch["timeouts"]),
+        )
+
+    def _achieved_goals(self, flat: np.ndarray) -> np.ndarray:
+        """Copies of what the transitions achieved (n, d)."""
+        if self.achieved is None:
+            return self._take(self.next_observations["achieved_goal"], flat)
+        return self.achieved.fields(self.achieved.take(flat))[_ACHIEVED]
+
+    def _take(self, store: np.ndarray, flat: np.ndarray) -> np.ndarray:
+        """Copy of the (slot, environment) entries with the given flat indices."""
+        return store.reshape(self.buffer_size * self.n_envs, *store.shape[2:]).take(flat, axis=0)
