@@ -38,7 +38,7 @@ def difference(config: dict[str, Any]) -> str:
     default = run_config(config["env_id"], method=config["method"], seed=config["seed"])
     ours, theirs = flat(config), flat(asdict(default))
     changed = [
-        f"{name.removeprefix('settings.').removeprefix('algorithm.')}={ours.get(name)}"
+        f"{name.removeprefix('settings.').removeprefix('algorithm.')}={ours.get(name, 'unset')}"
         for name in sorted({*ours, *theirs} - LIMITS)
         if ours.get(name) != theirs.get(name)
     ]
