@@ -17,7 +17,7 @@ from .cher import GoalSelection
 from .episode_table import EpisodeTable
 from .imagination import imagine
 from .keywords import check_keywords
-from .record_buffer import NEXT_DESIRED, RecordReplayBuffer
+from .record_buffer import NEXT_DESIRED, RecordReplayBuffer, check_finite
 from .wrappers import imagination_of
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
@@ -152,7 +152,7 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         Raises:
             ValueError: an environment returned NaN or infinity; nothing of the step is stored.
         """
-        _check_finite(obs, next_obs, action, reward)
+        check_finite(obs, next_obs, action, reward)
         pos = self.pos
         rows = [
             self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
@@ -400,18 +400,3 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         if self.env is None:
             raise RuntimeError("the replay buffer has no environment: call set_env() after loading")
         return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
-
-
-def _check_finite(
-    obs: dict[str, np.ndarray],
-    next_obs: dict[str, np.ndarray],
-    action: np.ndarray,
-    reward: np.ndarray,
-) -> None:
-    named = {f"the observation {key!r}": value for key, value in obs.items()}
-    named |= {f"the next observation {key!r}": value for key, value in next_obs.items()}
-    for name, array in {**named, "the action": action, "the reward": reward}.items():
-        finite = np.isfinite(array)
-        if not finite.all():
-            index = np.argwhere(~finite)[0, 0]
-            raise ValueError(f"{name} of environment {index} holds NaN or infinity")

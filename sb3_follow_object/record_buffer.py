@@ -177,3 +177,23 @@ class RecordReplayBuffer(HerReplayBuffer):
     def _take(self, store: np.ndarray, flat: np.ndarray) -> np.ndarray:
         """Copy of the (slot, environment) entries with the given flat indices."""
         return store.reshape(self.buffer_size * self.n_envs, *store.shape[2:]).take(flat, axis=0)
+
+
+def check_finite(
+    obs: dict[str, np.ndarray],
+    next_obs: dict[str, np.ndarray],
+    action: np.ndarray,
+    reward: np.ndarray,
+) -> None:
+    """Refuse a step of every environment that holds NaN or infinity.
+
+    Raises:
+        ValueError: with what holds it and of which environment.
+    """
+    named = {f"the observation {key!r}": value for key, value in obs.items()}
+    named |= {f"the next observation {key!r}": value for key, value in next_obs.items()}
+    for name, array in {**named, "the action": action, "the reward": reward}.items():
+        finite = np.isfinite(array)
+        if not finite.all():
+            index = np.argwhere(~finite)[0, 0]
+            raise ValueError(f"{name} of environment {index} holds NaN or infinity")
