@@ -19,7 +19,8 @@ from typing import Any
 from sb3_follow_object.config import run_config
 
 OUT = Path(__file__).with_name("ablations.csv")
-LIMITS = {"total_timesteps", "settings.n_threads", "seed"}
+# What does not change what is learned, or is a column of its own.
+LIMITS = {"total_timesteps", "settings.n_threads", "seed", "keep_checkpoints", "checkpoint_minutes"}
 
 
 def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
