@@ -113,13 +113,15 @@ def train(
         stack.callback(checkpoints.wait)
         # In a list that is emptied: it holds a replay buffer's worth of memory.
         loaded = [load_newest(folder, report) if resume else None]
+        wall_before = load_object_stage(folder, run, loaded[0])
         try:
+            if wall_before is None:
+                wall_before = _object_stage(config, folder, run, loaded, checkpoints, stop)
             if object_stage_only:
-                _object_stage(
-                    run, folder, loaded.pop(), checkpoints, config.checkpoint_minutes, stop
-                )
                 return {}
-            return _run_stages(config, folder, run, loaded, checkpoints, stop, progress, command)
+            return _run_stages(
+                config, folder, run, loaded, wall_before, checkpoints, stop, progress, command
+            )
         except Exception as error:
             checkpoints.wait()
             raise _stopped(error, run, folder) from error
@@ -130,17 +132,14 @@ def _run_stages(
     folder: Path,
     run: FollowObject,
     loaded: list[Any],
+    wall_before: float,
     checkpoints: Checkpoints,
     stop: StopSignals,
     progress: Progress,
     command: str,
 ) -> dict[str, Any]:
-    """Run what is left of the three stages and of the final test."""
+    """Run what is left of the robot's stage and of the final test."""
     saved = loaded.pop()
-    minutes = config.checkpoint_minutes
-    wall_before = 0.0
-    if run.has_object_stage:
-        wall_before = _object_stage(run, folder, saved, checkpoints, minutes, stop)
     if saved is not None and saved["stage"] != "robot":
         saved = None
     if saved is None:  # what was evaluated after the last checkpoint begins anew
@@ -167,7 +166,7 @@ def _run_stages(
     del saved
     model.set_logger(_logger(folder, run.env_steps))
     writer = CheckpointCallback(
-        checkpoints, keeper.state_dict, lambda: run.env_steps, minutes, stop
+        checkpoints, keeper.state_dict, lambda: run.env_steps, config.checkpoint_minutes, stop
     )
     run.learn(config.total_timesteps, callback=CallbackList([evaluation, keeper, writer]))
     eval_env.close()
@@ -198,22 +197,15 @@ def _run_stages(
 
 
 def _object_stage(
-    run: FollowObject,
+    config: RunConfig,
     folder: Path,
-    saved: Any,
+    run: FollowObject,
+    loaded: list[Any],
     checkpoints: Checkpoints,
-    minutes: float,
     stop: StopSignals,
 ) -> float:
-    """Bring what the object's stages make, learned now or before; return the seconds it took."""
-    kept = load_object_stage(folder, run)
-    if kept is not None:
-        return kept
-    if saved is not None and saved["stage"] == "robot":
-        raise ValueError(
-            f"{folder / OBJECT_STAGE} is missing, which says what the object stage cost; "
-            "put it back, or start another run"
-        )
+    """Run what is left of the stages before the robot's; return the seconds that they took."""
+    saved, loaded[0] = loaded[0], None
     wall_before = 0.0 if saved is None else saved["wall_s"]
     started = time.monotonic()
 
@@ -225,15 +217,12 @@ def _object_stage(
             checkpoints,
             lambda: {"stage": "object", "object": solved.state_dict(), "wall_s": wall_s()},
             lambda: solved.model.num_timesteps,
-            minutes,
+            config.checkpoint_minutes,
             stop,
         )
 
-    state = None if saved is None else saved["object"]
-    if run.imagine:
-        run.learn_predictor(writer, state, between_epochs=stop.check)
-    else:
-        run.learn_object(writer, state)
+    learn = run.learn_predictor if run.imagine else run.learn_object
+    learn(writer, None if saved is None else saved["object"], between_epochs=stop.check)
     save_object_stage(folder, run, wall_s())
     return wall_s()
 

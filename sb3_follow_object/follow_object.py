@@ -200,12 +200,14 @@ class FollowObject:
         self,
         callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
         state: dict[str, Any] | None = None,
+        between_epochs: Callable[[], None] = lambda: None,
     ) -> tuple[HerDDPG, StopWhenSolved]:
         """Run stage one (section 4.1): the object policy, and the networks that SLDR needs.
 
         Args:
             callback: makes a callback from the one that tests the object's policy.
             state: of that one; stage one goes on exactly from there.
+            between_epochs: called while the inverse model is fitted; may raise to stop.
         """
         settings = self.settings
         self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
@@ -225,12 +227,14 @@ class FollowObject:
             self.env_id,
             physics_id(self.env_id),
             seed=stream_seed(self.seed, "inverse"),
+            between_updates=between_epochs,
             **settings["inverse_fit"],
         )
         env.close()
         test_env.close()
-        self.report(f"  inverse model's error {self.object_networks.inverse_error:.3f}")
         self.object_steps = self.policy_steps = model.num_timesteps
+        error = self.object_networks.inverse_error
+        self.report(f"  {self.object_steps} env steps, inverse model's error {error:.3f}")
         self.object_success = solved.rates[-1] if solved.rates else float("nan")
         return model, solved
 
@@ -245,10 +249,10 @@ class FollowObject:
         Args:
             callback: as in `learn_object`.
             state: as in `learn_object`.
-            between_epochs: called while F_phi is fitted; may raise to stop.
+            between_epochs: called while F_phi and the inverse model are fitted; may raise to stop.
         """
         settings = self.settings
-        model, solved = self.learn_object(callback, state)
+        model, solved = self.learn_object(callback, state, between_epochs)
         env = self._object_env("paths")
         paths = collect_paths(model, env, settings["n_paths"])
         env.close()
@@ -304,7 +308,6 @@ class FollowObject:
         if self.uses_networks:
             if self.object_networks is None:
                 self.learn_object()
-                self.report(f"  {self.object_steps} env steps")
             networks = {"object_networks": self.object_networks}
             arguments["auxiliary"] = {**arguments["auxiliary"], **networks}
         self.model = HerDDPG(env=self.env, seed=stream_seed(self.seed, "networks"), **arguments)

@@ -19,14 +19,12 @@ from .envs.tasks import did_you_mean
 from .experiment import (
     CONFIG,
     OBJECT_STAGE,
-    PREDICTOR,
     RESULT,
     RunConfig,
     claim,
     difference,
 )
 from .files import atomic_write
-from .goal_predictor import FACTS_FILE
 from .sldr import reads_object_networks
 
 GRID, OBJECT, LOGS = "grid.json", "object", "logs"
@@ -183,8 +181,8 @@ def shared_stage(cell: Cell) -> Path | None:
 
 
 def stage_is_ready(stage: Path) -> bool:
-    """Whether an object stage has ended: both files are written last, in either order."""
-    return (stage / OBJECT_STAGE).exists() and (stage / PREDICTOR / FACTS_FILE).exists()
+    """Whether an object stage has ended: this file is its last."""
+    return (stage / OBJECT_STAGE).exists()
 
 
 def prepare(cell: Cell, stage: Path | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -94,6 +94,7 @@ class ObjectNetworks(nn.Module):
         batch_size: int = 256,
         updates: int = 3000,
         seed: int = 0,
+        between_updates: Callable[[], None] = lambda: None,
     ) -> ObjectNetworks:
         """Copy critic and policy of a trained object and fit the inverse model to its replay.
 
@@ -108,6 +109,7 @@ class ObjectNetworks(nn.Module):
             batch_size: transitions an update, >= 1.
             updates: >= 1.
             seed: of its weights.
+            between_updates: called after each; may raise to stop.
 
         Raises:
             ValueError: an argument is outside its range.
@@ -132,7 +134,7 @@ class ObjectNetworks(nn.Module):
         networks.nu.load_state_dict(model.actor.mu.state_dict())
         for copy, critic in zip(networks.critics, model.critic.q_networks, strict=True):
             copy.load_state_dict(critic.state_dict())
-        networks._fit_inverse(model, learning_rate, batch_size, updates, seed)
+        networks._fit_inverse(model, learning_rate, batch_size, updates, seed, between_updates)
         return networks
 
     @staticmethod
@@ -150,7 +152,13 @@ class ObjectNetworks(nn.Module):
             )
 
     def _fit_inverse(
-        self, model: HerDDPG, learning_rate: float, batch_size: int, updates: int, seed: int
+        self,
+        model: HerDDPG,
+        learning_rate: float,
+        batch_size: int,
+        updates: int,
+        seed: int,
+        between_updates: Callable[[], None],
     ) -> None:
         assert model.replay_buffer is not None
         with th.random.fork_rng(devices=[]):
@@ -173,6 +181,7 @@ class ObjectNetworks(nn.Module):
             loss.backward()
             optimizer.step()
             losses.append(loss.detach())
+            between_updates()
         self.inverse.requires_grad_(False)
         self.inverse_error = float(th.stack(losses[-100:]).mean())
 

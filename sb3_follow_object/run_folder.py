@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from .checkpoint import Camera, Snapshot, load_tree
+from .envs import physics_id
 from .files import LOCK, atomic_write
 from .follow_object import FollowObject, Report
 from .goal_predictor import FACTS_FILE, GoalPredictor
@@ -171,31 +172,41 @@ def save_object_stage(folder: Path, run: FollowObject, wall_s: float) -> None:
     atomic_write(folder / OBJECT_STAGE, json.dumps(facts).encode())
 
 
-def load_object_stage(folder: Path, run: FollowObject) -> float | None:
+def load_object_stage(folder: Path, run: FollowObject, saved: Any) -> float | None:
     """Give a run what its folder's object stage made.
 
+    Args:
+        folder: of the run.
+        run: is changed.
+        saved: the checkpoint that the run goes on from, None without one.
+
     Returns:
-        The seconds that it took; None where it has not ended.
+        The seconds that the stage took; None where it has not ended.
 
     Raises:
         ValueError: a file is missing, damaged or for another task.
     """
+    if not run.has_object_stage:
+        return 0.0
     path = folder / OBJECT_STAGE
-    if not path.exists():
+    robot_has_begun = isinstance(saved, dict) and saved.get("stage") == "robot"
+    if not path.exists() and not robot_has_begun:
         return None
-    for needed, file in (
-        (run.imagine, folder / PREDICTOR / FACTS_FILE),
-        (run.uses_networks, folder / OBJECT_FILE),
+    for needed, file, purpose in (
+        (True, path, "says what it cost"),
+        (run.imagine, folder / PREDICTOR / FACTS_FILE, "the robot's goals come from"),
+        (run.uses_networks, folder / OBJECT_FILE, "SLDR's reward reads"),
     ):
         if needed and not file.exists():
             raise ValueError(
-                f"{file} of the finished object stage is missing, which the robot's training "
-                "reads; put it back, or start another run"
+                f"{file} of the finished object stage is missing, which {purpose}; "
+                "put it back, or start another run"
             )
     if run.imagine:
         run.use_predictor(GoalPredictor.load(folder / PREDICTOR, env_id=run.env_id))
     if run.uses_networks:
-        run.object_networks = ObjectNetworks.load(folder / OBJECT_FILE, env_id=run.env_id)
+        physics = physics_id(run.env_id)
+        run.object_networks = ObjectNetworks.load(folder / OBJECT_FILE, run.env_id, physics)
     try:
         facts = json.loads(path.read_text())
         # A stage that other runs share may have more than this one uses.

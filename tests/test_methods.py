@@ -114,11 +114,11 @@ def test_lost_object_networks_are_missed_before_anything_starts(tmp_path: Path) 
     assert not (tmp_path / "run" / "predictor").exists(), "SLDR alone imagines no goals"
     networks = ObjectNetworks.load(tmp_path / "run" / FILE, env_id=TASK)
     (tmp_path / "run" / FILE).unlink()
-    with pytest.raises(RuntimeError, match="of the finished object stage is missing"):
+    with pytest.raises(ValueError, match="of the finished object stage is missing"):
         train(config, tmp_path / "run", resume=True, report=pytest.fail)
     networks.env_id = "FollowObject/PnPShelf-v0"
     networks.save(tmp_path / "run" / FILE)
-    with pytest.raises(RuntimeError, match="were made for env_id"):
+    with pytest.raises(ValueError, match="were made for env_id"):
         train(config, tmp_path / "run", resume=True, report=pytest.fail)
 
 

@@ -20,6 +20,8 @@ import torch as th
 from sb3_follow_object.checkpoint import load_tree, save_tree
 from sb3_follow_object.experiment import train
 from sb3_follow_object.follow_object import FollowObject
+from sb3_follow_object.object_networks import FILE as OBJECT_FILE
+from sb3_follow_object.object_networks import ObjectNetworks
 from sb3_follow_object.run_folder import Checkpoints, checkpoint_files, load_newest
 
 pytestmark = pytest.mark.xdist_group("resuming")  # the tests share one run
@@ -75,6 +77,50 @@ def test_sigterm_in_any_stage_checkpoints_and_resumes(
     train(runs.config(), tmp_path / "run", resume=True, report=report)
     assert runs.outcome(tmp_path / "run") == whole
     assert not checkpoint_files(tmp_path / "run")
+
+
+@pytest.mark.parametrize("imagine", [False, True])
+def test_sldr_stopped_in_stage_one_or_in_its_inverse_model_resumes(
+    imagine: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    algorithm = {**runs.TINY["algorithm"], "auxiliary": {"name": "sldr"}}
+    config = runs.config(
+        total_timesteps=2000, settings={"imagine": imagine, "algorithm": algorithm}
+    )
+    runs.run(tmp_path / "whole", config=config)
+    folder = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        train(config, folder, report=signal_at("checkpoint at 400 env"))
+    infer = ObjectNetworks.infer
+
+    def stopped(*arguments: Any) -> th.Tensor:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return infer(*arguments)
+
+    told: list[str] = []
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(ObjectNetworks, "infer", stopped)
+        train(config, folder, resume=True, report=told.append)
+    assert not any("inverse model's error" in said for said in told), "it stopped in the fit"
+    assert not (folder / OBJECT_FILE).exists()
+    train(config, folder, resume=True, report=told.append)
+    assert any("checkpoint at 1000 env" in said for said in told)
+    assert runs.outcome(folder) == runs.outcome(tmp_path / "whole")
+    assert (folder / "predictor").exists() == imagine
+
+
+@pytest.mark.parametrize("name", ["object_stage.json", "predictor/predictor.json"])
+def test_half_written_object_stage_is_learned_again_until_the_robot_begins(
+    name: str, crashed: Path, whole: dict[str, Any]
+) -> None:
+    (crashed / name).unlink()
+    with pytest.raises(ValueError, match=f"{name} of the finished object stage is missing"):
+        runs.run(crashed, resume=True)
+    (crashed / "object_stage.json").unlink(missing_ok=True)
+    for checkpoint in checkpoint_files(crashed):
+        checkpoint.unlink()
+    runs.run(crashed, resume=True)
+    assert runs.outcome(crashed) == whole
 
 
 def test_crash_before_the_first_checkpoint_starts_again(
@@ -154,9 +200,7 @@ def test_run_with_no_whole_checkpoint_is_refused(crashed: Path) -> None:
 def test_deleted_predictor_is_missed(crashed: Path) -> None:
     before = {path: path.read_bytes() for path in checkpoint_files(crashed)}
     shutil.rmtree(crashed / "predictor")
-    with pytest.raises(
-        RuntimeError, match=r"predictor.json of the finished object stage is missing"
-    ):
+    with pytest.raises(ValueError, match=r"predictor.json of the finished object stage is missing"):
         runs.run(crashed, resume=True)
     assert {path: path.read_bytes() for path in checkpoint_files(crashed)} == before
 
@@ -165,7 +209,7 @@ def test_predictor_of_another_object_is_refused(crashed: Path) -> None:
     facts = crashed / "predictor" / "predictor.json"
     assert '"object_on_table": true' in facts.read_text()  # a Push task's
     facts.write_text(facts.read_text().replace('on_table": true', 'on_table": false'))
-    with pytest.raises(RuntimeError, match=r"made with object_on_table=False, not True"):
+    with pytest.raises(ValueError, match=r"made with object_on_table=False, not True"):
         runs.run(crashed, resume=True)
 
 
