@@ -188,13 +188,15 @@ def replay() -> Iterator[Figure]:
 def replay_bytes() -> dict[str, float]:
     """Bytes that a stored transition takes, in NumPy arrays."""
     env = make_vec(ROBOT, 1, 1)
-    counts = {}
-    for buffer_class in (FollowObjectReplayBuffer, HerReplayBuffer):
-        buffer = buffer_class(1000, env.observation_space, env.action_space, env, "cpu", 1)  # type: ignore[arg-type]
-        arrays = [v for v in vars(buffer).values() if isinstance(v, np.ndarray)]
-        arrays += [*buffer.observations.values(), *buffer.next_observations.values()]
-        counts[buffer_class.__name__] = sum(a.nbytes for a in arrays) / 1000
-    return counts
+    arguments = (1000, env.observation_space, env.action_space, env, "cpu", 1)
+    ours = FollowObjectReplayBuffer(*arguments)  # type: ignore[arg-type]
+    theirs = HerReplayBuffer(*arguments)  # type: ignore[arg-type]
+    arrays = [v for v in vars(theirs).values() if isinstance(v, np.ndarray)]
+    arrays += [*theirs.observations.values(), *theirs.next_observations.values()]
+    return {
+        "FollowObjectReplayBuffer": ours.bytes_per_transition(),
+        "HerReplayBuffer": sum(array.nbytes for array in arrays) / 1000,
+    }
 
 
 # ---- learner -------------------------------------------------------------------------------------

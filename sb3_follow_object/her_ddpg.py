@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -19,12 +20,13 @@ from stable_baselines3.common.type_aliases import (
     TrainFreq,
     TrainFrequencyUnit,
 )
-from torch import nn
 
 from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
+from .device_replay import DeviceReplay
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .policies import HerPolicy
-from .tensors import lowest, matmul_at
+from .tensors import matmul_at
+from .updates import COLUMNS, Updates
 
 SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 
@@ -75,6 +77,10 @@ class HerDDPG(DDPG):
             {"name": "rnd"} or {"name": "sldr"} (or a subclass of `AuxiliaryReward` as the name),
             with the keyword arguments of the reward's class and "weight", 1 by default, of its
             critic. Its targets have bounds of their own; `hindsight_bound` does not touch them.
+        replay_on_device: keep a copy of the replay buffer on the learner's device and draw, relabel
+            and reward there, so that no batch is copied. None: on CUDA, where the buffer's settings
+            and the environment's reward allow it (`DeviceReplay`). True: also on the CPU, and an
+            error where they do not.
         policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.
 
     The other arguments are DDPG's.
@@ -113,6 +119,7 @@ class HerDDPG(DDPG):
         average_decay: float = 0.0,
         matmul_precision: str = "highest",
         auxiliary: dict[str, Any] | None = None,
+        replay_on_device: bool | None = None,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
@@ -134,6 +141,8 @@ class HerDDPG(DDPG):
             raise ValueError(
                 f"matmul_precision is {matmul_precision!r}; {', '.join(_PRECISIONS)} exist"
             )
+        if replay_on_device not in (None, False, True):
+            raise ValueError(f"replay_on_device is {replay_on_device!r}; give true, false or none")
         super().__init__(
             policy,
             env,
@@ -166,6 +175,7 @@ class HerDDPG(DDPG):
         self.matmul_precision = matmul_precision
         self.auxiliary = auxiliary
         self.auxiliary_critic: AuxiliaryCritic | None = None
+        self.replay_on_device = replay_on_device
         if _init_setup_model:
             self._setup_model()
 
@@ -195,11 +205,30 @@ class HerDDPG(DDPG):
             # Last, so that what is drawn above does not depend on it.
             rate = self.lr_schedule(1.0)
             self.auxiliary_critic = make_auxiliary(self.auxiliary, self.policy, rate, self.gamma)
+        self._updates = Updates(self)
+        self._device_replay = self._make_device_replay()
         if isinstance(self.train_freq, TrainFreq) and (
             self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1
         ):
             steps = self.train_freq.frequency * self._horizon()
             self.train_freq = TrainFreq(steps, TrainFrequencyUnit.STEP)
+
+    def _make_device_replay(self) -> DeviceReplay | None:
+        """Return the copy of the replay buffer on the device, if it is wanted and possible."""
+        wanted = self.replay_on_device
+        if wanted is False or (wanted is None and self.device.type != "cuda"):
+            return None
+        try:
+            if not isinstance(self.replay_buffer, FollowObjectReplayBuffer):
+                raise ValueError("replay on the device needs a FollowObjectReplayBuffer")
+            if self._vec_normalize_env is not None:
+                raise ValueError("replay on the device has no VecNormalize; HerDDPG needs none")
+            return DeviceReplay(self.replay_buffer, self.device, np.random.randint(2**31))
+        except ValueError as error:
+            if wanted:
+                raise
+            warnings.warn(f"Replay stays on the host: {error}.", stacklevel=2)
+            return None
 
     def _horizon(self) -> int:
         """Steps of an episode, from the environment's spec."""
@@ -257,7 +286,8 @@ class HerDDPG(DDPG):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "auxiliary_critic"]
+        names = ("auxiliary_critic", "_updates", "_device_replay")
+        return [*super()._excluded_save_params(), *names]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()
@@ -285,6 +315,9 @@ class HerDDPG(DDPG):
                 "pos": self._moments_pos,
             },
             "rng": self.rng.bit_generator.state,
+            "device_rng": None
+            if self._device_replay is None
+            else self._device_replay.generator.get_state(),
             "last_obs": self._last_obs,
             "counters": {name: getattr(self, name) for name in self._COUNTERS},
         }
@@ -300,6 +333,8 @@ class HerDDPG(DDPG):
         self.moments.mean, self.moments.var = moments["mean"].copy(), moments["var"].copy()
         self.moments.count, self._moments_pos = moments["count"], moments["pos"]
         self.rng.bit_generator.state = state["rng"]
+        if self._device_replay is not None and state["device_rng"] is not None:
+            self._device_replay.generator.set_state(state["device_rng"])
         self._last_obs = state["last_obs"]
         self._last_episode_starts = np.ones(self.n_envs, dtype=bool)
         for name in self._COUNTERS:
@@ -326,14 +361,10 @@ class HerDDPG(DDPG):
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         self._update_learning_rate(optimizers + ([auxiliary.optimizer] if auxiliary else []))
         self._update_moments()
-        low, high = self._target_bounds()
-        critics = self.critic.q_networks
-        critics_target = self.critic_target.q_networks
-        actor, actor_target = self.actor.mu, self.actor_target.mu
-        live, target = self._trained_parameters()
-        critic_losses, actor_losses = [], []
-        q_sum = reward_sum = th.zeros(())
-
+        if self._device_replay is not None:
+            assert isinstance(self.replay_buffer, FollowObjectReplayBuffer)
+            self._device_replay.refresh(self.replay_buffer)
+        told: list[th.Tensor] = []
         steps_left = gradient_steps
         while steps_left > 0:
             n = min(steps_left, max(1, _SAMPLE_CHUNK // batch_size))
@@ -348,61 +379,15 @@ class HerDDPG(DDPG):
                 self.actor.features_extractor(data.observations),
                 self.actor.features_extractor(data.next_observations),
             )
-            for batch, r, d, bound in zip(
-                chunk.split(batch_size),
-                data.rewards.split(batch_size),
-                data.dones.split(batch_size),
-                bounds.split(batch_size),
-                strict=True,
-            ):
-                x, next_x = batch.features, batch.next_features
-                self._n_updates += 1
-                with th.no_grad():
-                    next_in = th.cat([next_x, actor_target(next_x)], dim=1)
-                    next_q = lowest([net(next_in) for net in critics_target])
-                    target_q = (r + (1.0 - d) * self.gamma * next_q).clamp_(low, high)
-                    if self.hindsight_bound:
-                        target_q = th.maximum(target_q, bound)
-                critic_in = th.cat([x, batch.actions], dim=1)
-                critic_loss = sum(
-                    nn.functional.mse_loss(net(critic_in), target_q) for net in critics
-                )
-                assert isinstance(critic_loss, th.Tensor)
-                self.critic.optimizer.zero_grad()
-                critic_loss.backward()
-                self.critic.optimizer.step()
-                if auxiliary is not None:
-                    auxiliary.update(batch, critic_in, next_in, d)
-
-                # The actor's gradient passes through the critic, whose own is not wanted.
-                self.critic.requires_grad_(False)
-                policy_actions = actor(x)
-                actor_critic_in = th.cat([x, policy_actions], dim=1)
-                q = critics[0](actor_critic_in).mean()
-                value = q if auxiliary is None else q + auxiliary.value(actor_critic_in)
-                actor_loss = -value + self.action_l2 * policy_actions.square().mean()
-                self.actor.optimizer.zero_grad()
-                actor_loss.backward()
-                self.actor.optimizer.step()
-                self.critic.requires_grad_(True)
-
-                if self._n_updates % self.target_update_interval == 0:
-                    with th.no_grad():
-                        th._foreach_lerp_(target, live, self.tau)
-                critic_losses.append(critic_loss.detach())
-                actor_losses.append(actor_loss.detach())
-                q_sum = q_sum + q.detach()
-                reward_sum = reward_sum + r.mean()
+            told.append(self._updates.run(chunk, data.rewards, data.dones, bounds, batch_size))
 
         # A plain mean until there are enough updates for the share to be left.
         decay = min(self.average_decay**gradient_steps, 1.0 - gradient_steps / self._n_updates)
         self.policy.update_average(decay if self.average_decay > 0.0 else 0.0)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/actor_loss", th.stack(actor_losses).mean().item())
-        self.logger.record("train/critic_loss", th.stack(critic_losses).mean().item())
-        self.logger.record("train/q_mean", q_sum.item() / gradient_steps)
-        self.logger.record("train/reward_mean", reward_sum.item() / gradient_steps)
+        for name, value in zip(COLUMNS, th.cat(told).mean(dim=0).tolist(), strict=True):
+            self.logger.record(f"train/{name}", value)
         for name, mean in (auxiliary.take_log() if auxiliary else {}).items():
             self.logger.record(name, mean)
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
@@ -415,6 +400,8 @@ class HerDDPG(DDPG):
         buffer = self.replay_buffer
         assert buffer is not None
         if isinstance(buffer, FollowObjectReplayBuffer):
+            if self._device_replay is not None:
+                return self._device_replay.sample_with_steps(n)
             return buffer.sample_with_steps(n, self._vec_normalize_env, n_batches)
         data = buffer.sample(n, env=self._vec_normalize_env)
         return data, th.full((n, 1), th.inf, device=self.device)

@@ -135,6 +135,8 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         # Whether what a slot achieved is far enough from where its episode began.
         self._far = np.zeros(self.dones.shape if min_goal_distance > 0.0 else (0,), dtype=bool)
         self.table = EpisodeTable()
+        self.n_added = 0  # time-steps so far
+        self.revision = 0  # counts contents that were loaded over the earlier ones
 
     def add(  # type: ignore[override]
         self,
@@ -167,6 +169,7 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         if self.imagined_ratio > 0.0:
             self.original_goals[pos] = [info["original_goal"] for info in infos]
         super(HerReplayBuffer, self).add(obs, next_obs, action, reward, done, infos)
+        self.n_added += 1
         for env_idx in np.flatnonzero(done):
             if "diverged" in infos[env_idx]:
                 self._current_ep_start[env_idx] = self.pos
@@ -236,6 +239,7 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         for name, store in stores.items():
             store[: len(slots[name])] = slots[name]
         self.pos, self.full = state["pos"], state["full"]
+        self.revision += 1
         self._current_ep_start = state["current_episode_start"].copy()
         self.table.load_state_dict(state["table"])
         self.rng.bit_generator.state = state["rng"]
@@ -249,6 +253,14 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         if self.min_goal_distance > 0.0:
             stores["far"] = self._far
         return stores
+
+    def check_ready(self) -> None:
+        """Raise RuntimeError while there is nothing to draw from."""
+        if self.table.n_transitions() == 0:
+            raise RuntimeError(
+                "the replay buffer holds no finished episode yet; "
+                "set learning_starts to at least one episode of every environment"
+            )
 
     def moved_share(self) -> float:
         """Share of the stored transitions that belong to episodes in which the object moved."""
@@ -289,11 +301,7 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
             The transitions, and (batch_size, 1) float: -1s that the episode was paid from the
             transition until it stood on the hindsight goal; infinite where the goal shown is kept.
         """
-        if self.table.n_transitions() == 0:
-            raise RuntimeError(
-                "the replay buffer holds no finished episode yet; "
-                "set learning_starts to at least one episode of every environment"
-            )
+        self.check_ready()
         if self.selection is not None:
             batch_size *= self.selection.candidates
         row, step = self._draw(batch_size)

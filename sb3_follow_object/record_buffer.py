@@ -10,9 +10,9 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from .records import Records
 
-_HALVES = ("observations", "next_observations")
-_DESIRED, NEXT_DESIRED = "observations.desired_goal", "next_observations.desired_goal"
-_ACHIEVED = "next_observations.achieved_goal"
+HALVES = ("observations", "next_observations")
+DESIRED, NEXT_DESIRED = "observations.desired_goal", "next_observations.desired_goal"
+ACHIEVED = "next_observations.achieved_goal"
 
 
 @dataclass
@@ -62,7 +62,7 @@ class RecordReplayBuffer(HerReplayBuffer):
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         fields: dict[str, tuple[int, ...]] = {}
-        for half in _HALVES:
+        for half in HALVES:
             store = getattr(self, half)
             for key, array in store.items():
                 if array.dtype == np.float64:
@@ -72,14 +72,14 @@ class RecordReplayBuffer(HerReplayBuffer):
         if self.actions.dtype == np.float32:
             fields["actions"] = self.actions.shape[2:]
         fields |= {"rewards": (), "dones": (), "timeouts": ()}
-        self._goals_are_shared = fields.pop(NEXT_DESIRED, None) is not None
-        goal = fields.pop(_ACHIEVED, None)
+        self.goals_are_shared = fields.pop(NEXT_DESIRED, None) is not None
+        goal = fields.pop(ACHIEVED, None)
         self.records = Records(self.buffer_size, self.n_envs, fields)
         # Three coordinates and an empty place are read in half the time of three.
         self.achieved = (
             None
             if goal is None
-            else Records(self.buffer_size, self.n_envs, {_ACHIEVED: goal}, block=4, spare=0.34)
+            else Records(self.buffer_size, self.n_envs, {ACHIEVED: goal}, block=4, spare=0.34)
         )
         for name in ("ep_start", "ep_length"):  # half of SB3's bytes
             setattr(self, name, np.zeros((self.buffer_size, self.n_envs), dtype=np.int32))
@@ -90,8 +90,8 @@ class RecordReplayBuffer(HerReplayBuffer):
         views = self.records.views()
         if self.achieved is not None:
             views |= self.achieved.views()
-        if self._goals_are_shared:
-            views[NEXT_DESIRED] = views[_DESIRED]
+        if self.goals_are_shared:
+            views[NEXT_DESIRED] = views[DESIRED]
         return views
 
     def _connect(self) -> None:
@@ -105,16 +105,21 @@ class RecordReplayBuffer(HerReplayBuffer):
 
     def _share_goals(self, shared: bool) -> None:
         """Store desired goals of observations and next observations once, or twice."""
-        self._goals_are_shared = shared
+        self.goals_are_shared = shared
         goals = self.observations["desired_goal"]
         self.next_observations["desired_goal"] = goals if shared else goals.copy()
 
     def _make_room_for(self, obs: dict[str, np.ndarray], next_obs: dict[str, np.ndarray]) -> None:
         """Store desired goals twice from now on if those of a step differ."""
-        if self._goals_are_shared and not np.array_equal(
+        if self.goals_are_shared and not np.array_equal(
             obs["desired_goal"], next_obs["desired_goal"]
         ):
             self._share_goals(False)
+
+    def bytes_per_transition(self) -> float:
+        """Bytes of arrays that a stored transition takes."""
+        n_bytes = sum(store.nbytes for store in self._stores().values())
+        return n_bytes / (self.buffer_size * self.n_envs)
 
     def _stores(self) -> dict[str, np.ndarray]:
         """Every array with one entry a slot, none of them a view of another."""
@@ -122,7 +127,7 @@ class RecordReplayBuffer(HerReplayBuffer):
         if self.achieved is not None:
             stores["achieved"] = self.achieved.array
         views = self._views()
-        for half in _HALVES:
+        for half in HALVES:
             for key, array in getattr(self, half).items():
                 stores[f"{half}.{key}"] = array
         for name in ("actions", "ep_start", "ep_length"):
@@ -132,7 +137,7 @@ class RecordReplayBuffer(HerReplayBuffer):
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
         views = self._views()
-        for half in _HALVES:
+        for half in HALVES:
             state[half] = {
                 key: None if f"{half}.{key}" in views else array
                 for key, array in state[half].items()
@@ -149,16 +154,16 @@ class RecordReplayBuffer(HerReplayBuffer):
         What they achieved (n, d) has been copied already.
         """
         batch = self.records.fields(self.records.take(flat))
-        batch[_ACHIEVED] = achieved
-        if self._goals_are_shared:
-            batch[NEXT_DESIRED] = batch[_DESIRED]
+        batch[ACHIEVED] = achieved
+        if self.goals_are_shared:
+            batch[NEXT_DESIRED] = batch[DESIRED]
 
         def field(name: str, store: np.ndarray) -> np.ndarray:
             return batch[name] if name in batch else self._take(store, flat)
 
         obs, next_obs = (
             {key: field(f"{half}.{key}", store) for key, store in getattr(self, half).items()}
-            for half in _HALVES
+            for half in HALVES
         )
         return Gathered(
             obs,
@@ -172,7 +177,7 @@ class RecordReplayBuffer(HerReplayBuffer):
         """Copies of what the transitions achieved (n, d)."""
         if self.achieved is None:
             return self._take(self.next_observations["achieved_goal"], flat)
-        return self.achieved.fields(self.achieved.take(flat))[_ACHIEVED]
+        return self.achieved.fields(self.achieved.take(flat))[ACHIEVED]
 
     def _take(self, store: np.ndarray, flat: np.ndarray) -> np.ndarray:
         """Copy of the (slot, environment) entries with the given flat indices."""

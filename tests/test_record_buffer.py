@@ -169,6 +169,14 @@ def test_records_begin_with_cache_lines_where_that_is_cheap() -> None:
     assert Records(2, 1, {"a": (18,), "b": ()}).array.shape == (2, 1, 19)
 
 
+def test_memory_per_transition() -> None:
+    """7 + 3 + 7 numbers of observations, a goal, 2 of the action, 3 more and what was achieved."""
+    buffer = make_buffer(5)
+    assert buffer.records.array.shape[-1] == 25
+    bookkeeping = 2 * 4
+    assert buffer.bytes_per_transition() == 4 * (25 + 4) + bookkeeping
+
+
 def test_goals_that_move_within_an_episode_are_kept_apart() -> None:
     buffer = make_buffer(30, n_sampled_goal=0)
     resumed = make_buffer(0)
