@@ -6,7 +6,6 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import torch as th
@@ -39,12 +38,7 @@ class StopSignals:
             self._earlier[sig] = signal.signal(sig, self._note)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         for sig, handler in self._earlier.items():
             signal.signal(sig, handler)
 
