@@ -17,7 +17,6 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -328,16 +327,6 @@ def _line(row: dict[str, Any]) -> str:
     return f"{line}  {row['baseline']:>12,.1f}  {row['ratio']:.2f}x {row['baseline_name']}"
 
 
-@contextmanager
-def _threads(n: int) -> Iterator[None]:
-    earlier = th.get_num_threads()
-    th.set_num_threads(n)
-    try:
-        yield
-    finally:
-        th.set_num_threads(earlier)
-
-
 def _version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)
@@ -356,18 +345,13 @@ def main() -> None:
 
     figures: list[dict[str, Any]] = []
     print(f"{'figure':34}{'ours':>12}  {'baseline':>12}  ratio")
-    with _threads(1):  # a run's own setting: the cores are shared out between runs
-        for part in chosen:
-            for figure in parts[part]():
-                for row in compare(figure, arguments.rounds):
-                    figures.append(row)
-                    versus = "" if row["ratio"] is None else f"{row['baseline']:>12,.1f}"
-                    ratio = "" if row["ratio"] is None else f"{row['ratio']:.2f}x"
-                    name, against = row["name"], row["baseline_name"] or ""
-                    print(
-                        f"{name:34}{row['ours']:>12,.1f}  {versus}  {ratio} {against}", flush=True
-                    )
-        arithmetic_share(figures)
+    th.set_num_threads(1)  # a run's own setting: the cores are shared out between runs
+    for part in chosen:
+        for figure in parts[part]():
+            for row in compare(figure, arguments.rounds):
+                figures.append(row)
+                print(_line(row), flush=True)
+    arithmetic_share(figures)
     if arguments.only:
         return
     report = {

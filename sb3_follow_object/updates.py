@@ -73,19 +73,32 @@ class Updates:
     ) -> th.Tensor:
         names, parts = list(inputs), [value.split(batch_size) for value in inputs.values()]
         batches = [None] * len(parts[0]) if chunk is None else chunk.split(batch_size)
+        limits, parameters = self._model._target_bounds(), self._model._trained_parameters()
         return th.stack(
             [
                 self._step(
-                    dict(zip(names, part, strict=True)), batch, self._model._n_updates + number
+                    dict(zip(names, part, strict=True)),
+                    batch,
+                    self._model._n_updates + number,
+                    limits,
+                    parameters,
                 )
                 for number, (batch, *part) in enumerate(zip(batches, *parts, strict=True), 1)
             ]
         )
 
     def _step(
-        self, inputs: dict[str, th.Tensor], batch: Transitions | None, number: int
+        self,
+        inputs: dict[str, th.Tensor],
+        batch: Transitions | None,
+        number: int,
+        limits: tuple[float, float],
+        parameters: tuple[list[th.Tensor], list[th.Tensor]],
     ) -> th.Tensor:
-        """Take the step of this number, of critic, actor and, when it is time, targets."""
+        """Take the step of this number, of critic, actor and, when it is time, targets.
+
+        Targets are clipped to `limits`; `parameters` are the live networks' and the targets'.
+        """
         model, auxiliary = self._model, self._model.auxiliary_critic
         critic, critics = model.critic, model.critic.q_networks
         actor, actor_target = model.actor.mu, model.actor_target.mu
@@ -95,7 +108,7 @@ class Updates:
             next_in = th.cat([next_x, actor_target(next_x)], dim=1)
             next_q = lowest([net(next_in) for net in model.critic_target.q_networks])
             target_q = rewards + (1.0 - dones) * model.gamma * next_q
-            target_q = target_q.clamp_(*model._target_bounds())
+            target_q = target_q.clamp_(*limits)
             if model.hindsight_bound:
                 target_q = th.maximum(target_q, inputs["bounds"])
         critic_in = th.cat([x, inputs["actions"]], dim=1)
@@ -121,7 +134,7 @@ class Updates:
         critic.requires_grad_(True)
 
         if number % model.target_update_interval == 0:
-            live, target = model._trained_parameters()
+            live, target = parameters
             with th.no_grad():
                 th._foreach_lerp_(target, live, model.tau)
         told = (critic_loss.detach(), actor_loss.detach(), q.detach(), rewards.mean())
