@@ -116,7 +116,9 @@ def train(
         wall_before = load_object_stage(folder, run, loaded[0])
         try:
             if wall_before is None:
-                wall_before = _object_stage(config, folder, run, loaded, checkpoints, stop)
+                wall_before = _object_stage(
+                    config, folder, run, loaded, checkpoints, stop, shared=object_stage_only
+                )
             if object_stage_only:
                 return {}
             return _run_stages(
@@ -203,8 +205,12 @@ def _object_stage(
     loaded: list[Any],
     checkpoints: Checkpoints,
     stop: StopSignals,
+    shared: bool,
 ) -> float:
-    """Run what is left of the stages before the robot's; return the seconds that they took."""
+    """Run what is left of the stages before the robot's; return the seconds that they took.
+
+    One that runs share makes what any of them may need.
+    """
     saved, loaded[0] = loaded[0], None
     wall_before = 0.0 if saved is None else saved["wall_s"]
     started = time.monotonic()
@@ -222,7 +228,8 @@ def _object_stage(
         )
 
     learn = run.learn_predictor if run.imagine else run.learn_object
-    learn(writer, None if saved is None else saved["object"], between_epochs=stop.check)
+    state = None if saved is None else saved["object"]
+    learn(writer, state, between_epochs=stop.check, networks=shared)
     save_object_stage(folder, run, wall_s())
     return wall_s()
 

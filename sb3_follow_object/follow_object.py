@@ -201,13 +201,15 @@ class FollowObject:
         callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
         state: dict[str, Any] | None = None,
         between_epochs: Callable[[], None] = lambda: None,
+        networks: bool = False,
     ) -> tuple[HerDDPG, StopWhenSolved]:
-        """Run stage one (section 4.1): the object policy, and the networks that SLDR needs.
+        """Run stage one (section 4.1): the object policy, and with SLDR the networks that it needs.
 
         Args:
             callback: makes a callback from the one that tests the object's policy.
             state: of that one; stage one goes on exactly from there.
             between_epochs: called while the inverse model is fitted; may raise to stop.
+            networks: whether to make what SLDR needs for others, though this run does not.
         """
         settings = self.settings
         self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
@@ -222,19 +224,20 @@ class FollowObject:
             state=state,
             **settings["object_algorithm"],
         )
-        self.object_networks = ObjectNetworks.learned(
-            model,
-            self.env_id,
-            physics_id(self.env_id),
-            seed=stream_seed(self.seed, "inverse"),
-            between_updates=between_epochs,
-            **settings["inverse_fit"],
-        )
+        self.object_steps = self.policy_steps = model.num_timesteps
+        if networks or self.uses_networks:
+            self.object_networks = ObjectNetworks.learned(
+                model,
+                self.env_id,
+                physics_id(self.env_id),
+                seed=stream_seed(self.seed, "inverse"),
+                between_updates=between_epochs,
+                **settings["inverse_fit"],
+            )
+            error = self.object_networks.inverse_error
+            self.report(f"  {self.object_steps} env steps, inverse model's error {error:.3f}")
         env.close()
         test_env.close()
-        self.object_steps = self.policy_steps = model.num_timesteps
-        error = self.object_networks.inverse_error
-        self.report(f"  {self.object_steps} env steps, inverse model's error {error:.3f}")
         self.object_success = solved.rates[-1] if solved.rates else float("nan")
         return model, solved
 
@@ -243,6 +246,7 @@ class FollowObject:
         callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
         state: dict[str, Any] | None = None,
         between_epochs: Callable[[], None] = lambda: None,
+        networks: bool = False,
     ) -> GoalPredictor:
         """Run stages one and two: object policy, then F_phi (sections 4.1 and 4.2).
 
@@ -250,9 +254,10 @@ class FollowObject:
             callback: as in `learn_object`.
             state: as in `learn_object`.
             between_epochs: called while F_phi and the inverse model are fitted; may raise to stop.
+            networks: as in `learn_object`.
         """
         settings = self.settings
-        model, solved = self.learn_object(callback, state, between_epochs)
+        model, solved = self.learn_object(callback, state, between_epochs, networks)
         env = self._object_env("paths")
         paths = collect_paths(model, env, settings["n_paths"])
         env.close()

@@ -66,7 +66,7 @@ def learn_predictor(
         config.env_id, seed=config.seed, report=report, **{**config.settings, "n_envs": 1}
     )
     try:
-        predictor = run.learn_predictor()
+        predictor = run.learn_predictor(networks=True)
     finally:
         run.close()
     assert run.object_networks is not None
