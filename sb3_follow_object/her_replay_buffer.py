@@ -326,7 +326,8 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         batch = self._gather(flat, achieved)
         batch.rewards[virtual] = rewards
         for desired in batch.desired_goals():
-            desired[virtual] = goals
+            for i in range(goals.shape[1]):  # half the time of all at once, for a few coordinates
+                desired[virtual, i] = goals[:, i]
 
         if self.selection is not None:
             chosen = self.selection.choose(
@@ -384,7 +385,9 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         else:
             chosen = self.rng.integers(0, length)
         flat = self._flat(episode, chosen)
-        steps = np.where(chosen >= step, chosen - step, np.float32(np.inf))
+        steps = (chosen - step).astype(np.float32)
+        if self.goal_selection_strategy == GoalSelectionStrategy.EPISODE:
+            steps[steps < 0] = np.inf
         far = self._take(self._far, flat) if self.min_goal_distance > 0.0 else None
         return self._achieved_goals(flat), steps, far
 
