@@ -20,7 +20,8 @@ from sb3_follow_object.config import run_config
 
 OUT = Path(__file__).with_name("ablations.csv")
 # What does not change what is learned, or is a column of its own.
-LIMITS = {"total_timesteps", "settings.n_threads", "seed", "keep_checkpoints", "checkpoint_minutes"}
+LIMITS = {"total_timesteps", "settings.n_threads", "seed", "checkpoint_minutes"}
+LIMITS |= {"keep_checkpoints", "keep_last_checkpoint"}
 
 
 def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import re
 import shlex
@@ -95,7 +96,12 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--run", type=Path, required=True, metavar="FOLDER", help="run folder")
     _add_settings(train)
     train.add_argument("--method", choices=METHODS, help="default: fo")
-    train.add_argument("--steps", type=int, metavar="N", help="env steps, all stages counted")
+    train.add_argument(
+        "--steps",
+        type=int,
+        metavar="N",
+        help="env steps, all stages counted; with --resume: other ones than before",
+    )
     train.add_argument("--n-envs", type=int, metavar="N", help="parallel copies of the robot")
     train.add_argument(
         "--threads", type=int, metavar="N", help="threads of the simulation and of PyTorch"
@@ -219,8 +225,8 @@ def _train(args: argparse.Namespace) -> None:
 
 
 def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> None:
-    """Draw what a finished run folder has no picture of yet; say what could not be drawn."""
-    from .experiment import POLICY, PREDICTOR
+    """Draw what a finished run folder has no new picture of; say what could not be drawn."""
+    from .experiment import POLICY, PREDICTOR, RESULT
     from .goal_predictor import GoalPredictor
     from .pictures import draw_imagined, draw_task, record
     from .plots import draw_curves
@@ -236,7 +242,8 @@ def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> Non
     makers[VIDEO] = lambda out: record(run / POLICY, env_id, out)
     failed: dict[str, list[str]] = {}
     for name, make in makers.items():
-        if (run / name).exists():
+        picture = run / name
+        if picture.exists() and picture.stat().st_mtime >= (run / RESULT).stat().st_mtime:
             continue
         try:
             make(run / name)
@@ -266,15 +273,16 @@ def _config(args: argparse.Namespace) -> RunConfig:
 
 
 def _resumed_config(args: argparse.Namespace) -> RunConfig:
-    """Return the folder's configuration; flags may repeat it but not change it."""
+    """Return the folder's configuration; flags may repeat it and change only the steps."""
     from .config import load_config
 
     config = load_config(args.run)
+    if args.steps is not None:
+        config = dataclasses.replace(config, total_timesteps=args.steps)
     said = {
         "env": (args.env, config.env_id),
         "method": (args.method, config.method),
         "seed": (args.seed, config.seed),
-        "steps": (args.steps, config.total_timesteps),
         "n-envs": (args.n_envs, config.settings.get("n_envs")),
         "threads": (args.threads, config.torch_threads),
     }
@@ -283,6 +291,7 @@ def _resumed_config(args: argparse.Namespace) -> RunConfig:
             raise ValueError(f"the run in {args.run} has --{name} {kept}, not {given}")
     if args.set or args.config or args.preset:
         args.env, args.method, args.seed = config.env_id, config.method, config.seed
+        args.steps = config.total_timesteps
         return _config(args)  # train() compares it with the folder's
     return config
 

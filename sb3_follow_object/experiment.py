@@ -40,9 +40,12 @@ from .run_folder import (
     checkpoint_files,
     claim,
     difference,
+    finished_result,
     load_newest,
     load_object_stage,
+    noted_command,
     save_object_stage,
+    take_steps,
     trained_steps,
 )
 from .seeds import stream_seed
@@ -67,7 +70,8 @@ def train(
     """Train in a folder and return its result, also written to result.json.
 
     Interrupting (Ctrl-C or SIGTERM) writes a checkpoint first; `resume=True` goes on from the last
-    one and ends as the uninterrupted run would have.
+    one and ends as the uninterrupted run would have, also with another `total_timesteps` than it
+    began with.
 
     Args:
         config: what to train.
@@ -79,8 +83,8 @@ def train(
         object_stage_only: end where the robot's training would begin, and return nothing.
 
     Raises:
-        ValueError: the folder holds another run, none where one should be resumed, or one that
-            another process trains.
+        ValueError: the folder holds another run, none where one should be resumed, one that another
+            process trains, or a finished one that kept no checkpoint for the steps asked for.
         RuntimeError: the training cannot go on; the last checkpoint is as it was.
         KeyboardInterrupt: after the checkpoint of an interrupted run.
     """
@@ -89,9 +93,11 @@ def train(
         if resume:
             check_same_run(folder, config)
             stack.enter_context(lock(folder, wait=False))
-            if (folder / RESULT).exists():
+            result = finished_result(folder, config)
+            if result is not None:
                 report(f"{folder} is finished already")
-                return dict(json.loads((folder / RESULT).read_text()))
+                return result
+            take_steps(folder, config, command)
             remove_half_written(folder)
         else:
             check_empty(folder)
@@ -108,7 +114,7 @@ def train(
         if not resume:
             folder.mkdir(parents=True, exist_ok=True)
             stack.enter_context(lock(folder, wait=False))
-            claim(folder, config)
+            claim(folder, config, command)
         checkpoints = Checkpoints(folder, config.keep_checkpoints, report)
         stack.callback(checkpoints.wait)
         # In a list that is emptied: it holds a replay buffer's worth of memory.
@@ -190,11 +196,11 @@ def _run_stages(
         "wall_s": round(evaluation.wall_s, 1),
         "success_rate": episodes.success_rate,
         "episodes": config.n_final_episodes,
-        "command": command,
+        "command": noted_command(folder, command),
         "k_max": run.curriculum.k_max if run.imagine else None,
     }
     atomic_write(folder / RESULT, json.dumps(result, indent=2).encode())
-    checkpoints.remove()
+    checkpoints.remove(keep_last=config.keep_last_checkpoint)
     return result
 
 

@@ -9,7 +9,7 @@ import platform
 import subprocess
 import threading
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
 PREDICTOR, OBJECT_STAGE = "predictor", "object_stage.json"
 POLICY, LAST_POLICY = "policy.safetensors", "last_policy.safetensors"
 CHECKPOINTS = "checkpoint-*.safetensors"
+COMMAND = "command.txt"  # what started the run, and what gave it other steps later
 PACKAGES = ["sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics"]
 PACKAGES += ["mujoco", "torch", "numpy"]
 
@@ -50,6 +51,7 @@ class RunConfig:
         n_final_episodes: fresh episodes of the final test of the kept policy, >= 1.
         checkpoint_minutes: wall time between two checkpoints, > 0; does not change the result.
         keep_checkpoints: how many of the last checkpoints are kept, >= 1.
+        keep_last_checkpoint: whether a finished run keeps one, to be given more steps later.
         torch_threads: of PyTorch; the last bits of a result may depend on it.
     """
 
@@ -63,6 +65,7 @@ class RunConfig:
     n_final_episodes: int = 380
     checkpoint_minutes: float = 5.0
     keep_checkpoints: int = 2
+    keep_last_checkpoint: bool = False
     torch_threads: int = 1
 
     def __post_init__(self) -> None:
@@ -70,6 +73,10 @@ class RunConfig:
             value = getattr(self, name)
             if type(value) is not int or value < low:
                 raise ValueError(f"{name} is {value!r}; it must be at least {low}")
+        if type(self.keep_last_checkpoint) is not bool:
+            raise ValueError(
+                f"keep_last_checkpoint is {self.keep_last_checkpoint!r}; it must be true or false"
+            )
         if not self.checkpoint_minutes > 0.0:
             raise ValueError(f"checkpoint_minutes is {self.checkpoint_minutes}; it must be > 0")
 
@@ -86,15 +93,16 @@ def check_empty(folder: Path) -> None:
 
 
 def check_same_run(folder: Path, config: RunConfig) -> None:
-    """Raise a ValueError unless the folder holds the run that the configuration describes."""
+    """Raise a ValueError unless the folder holds the run of the configuration, steps apart."""
     path = folder / CONFIG
     if not path.exists():
         raise ValueError(f"{folder} holds no run to resume")
     try:
-        kept = asdict(RunConfig(**json.loads(path.read_text())))
+        kept = RunConfig(**json.loads(path.read_text()))
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not the configuration of a run ({error})") from error
-    different = difference(kept, asdict(config))
+    same_steps = replace(kept, total_timesteps=config.total_timesteps)
+    different = difference(asdict(same_steps), asdict(config))
     if different is not None:
         name, ours, theirs = different
         raise ValueError(
@@ -121,14 +129,53 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def claim(folder: Path, config: RunConfig) -> None:
+def claim(folder: Path, config: RunConfig, command: str = "") -> None:
     """Create a run's folder with its config and versions: what `train(resume=True)` asks for."""
     folder.mkdir(parents=True, exist_ok=True)
     check_empty(folder)  # again, now that no other process can come in between
     versions: dict[str, str | None] = {n: importlib.metadata.version(n) for n in PACKAGES}
     versions |= {"python": platform.python_version(), "commit": source_commit()}
     atomic_write(folder / "versions.json", json.dumps(versions, indent=2).encode())
+    if command:
+        atomic_write(folder / COMMAND, f"{command}\n".encode())
     atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
+
+
+def take_steps(folder: Path, config: RunConfig, command: str = "") -> None:
+    """Note in a run's folder the steps that it is resumed with, where they are others."""
+    kept = RunConfig(**json.loads((folder / CONFIG).read_text()))
+    if kept.total_timesteps == config.total_timesteps:
+        return
+    if command and (folder / COMMAND).exists():
+        earlier = (folder / COMMAND).read_text()
+        atomic_write(folder / COMMAND, f"{earlier}{command}\n".encode())
+    atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
+
+
+def noted_command(folder: Path, command: str = "") -> str:
+    """Return what made a run, as one line of a shell; `command` where its folder does not say."""
+    if not (folder / COMMAND).exists():
+        return command
+    return " && ".join((folder / COMMAND).read_text().splitlines())
+
+
+def finished_result(folder: Path, config: RunConfig) -> dict[str, Any] | None:
+    """Return the result of a run that has had its steps; None for one that can go on.
+
+    Raises:
+        ValueError: it ended after fewer and kept no checkpoint to go on from.
+    """
+    if not (folder / RESULT).exists():
+        return None
+    result = dict(json.loads((folder / RESULT).read_text()))
+    if result["env_steps"] >= config.total_timesteps:
+        return result
+    if not checkpoint_files(folder):
+        raise ValueError(
+            f"the run in {folder} ended after {result['env_steps']} env steps and kept no "
+            "checkpoint to go on from; one started with --set keep_last_checkpoint=true keeps it"
+        )
+    return None
 
 
 def source_commit() -> str | None:
@@ -296,10 +343,11 @@ class Checkpoints:
         self._thread = None
         self.report(self._outcome)
 
-    def remove(self) -> None:
-        """Remove all checkpoints: the run has its result."""
+    def remove(self, keep_last: bool = False) -> None:
+        """Remove all checkpoints, or all but the last: the run has its result."""
         self.wait()
-        for path in checkpoint_files(self.folder):
+        files = checkpoint_files(self.folder)
+        for path in files[:-1] if keep_last else files:
             path.unlink()
 
     def _write(self, env_steps: int, snapshot: Snapshot, stalled: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -86,7 +87,7 @@ def test_run_folder_holds_all_that_was_promised(finished: Path) -> None:
     assert {name for name in names if name.startswith(".")} == {".lock"}, "half-written files"
     result = json.loads((finished / "result.json").read_text())
     assert result["env_steps"] >= 3000
-    assert result["command"] == f"sb3-follow-object train --run {finished} --resume"
+    assert result["command"] == shlex.join(["sb3-follow-object", *START, "--run", str(finished)])
 
 
 def test_evaluation_repeats_the_final_test(
@@ -130,6 +131,7 @@ def test_finished_run_is_left_as_it_is(finished: Path, capsys: pytest.CaptureFix
         (["--env", "FollowObject/PnPShelf-v0"], f"has --env {TASK}, not FollowObject/PnPShelf-v0"),
         (["--method", "her"], "has --method fo, not her"),
         (["--set", "curriculum.p=0.9"], "settings.curriculum.p"),
+        (["--steps", "9000"], "kept no checkpoint to go on from"),
     ],
 )
 def test_resuming_changes_nothing(

@@ -213,6 +213,28 @@ def test_predictor_of_another_object_is_refused(crashed: Path) -> None:
         runs.run(crashed, resume=True)
 
 
+def test_finished_run_given_more_steps_is_the_longer_run(
+    whole: dict[str, Any], tmp_path: Path
+) -> None:
+    shorter = runs.config(total_timesteps=3000, keep_last_checkpoint=True)
+    assert runs.run(tmp_path, config=shorter, command="train")["env_steps"] < 3600
+    assert len(checkpoint_files(tmp_path)) == 1
+    longer = runs.config(keep_last_checkpoint=True)
+    result = runs.run(tmp_path, config=longer, command="go on", resume=True)
+    assert result["command"] == "train && go on"
+    assert runs.run(tmp_path, config=longer, resume=True) == result  # finished
+    checkpoint_files(tmp_path)[0].unlink()
+    assert runs.outcome(tmp_path) == whole
+
+
+def test_finished_run_without_a_checkpoint_is_given_no_more_steps(tmp_path: Path) -> None:
+    runs.run(tmp_path, config=runs.config(total_timesteps=3000))
+    kept = runs.outcome(tmp_path)
+    with pytest.raises(ValueError, match=r"ended after \d+ env steps and kept no checkpoint"):
+        runs.run(tmp_path, resume=True)
+    assert runs.outcome(tmp_path) == kept
+
+
 def test_only_the_last_checkpoints_are_kept(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path, 3, runs.quiet)
     for steps in (10, 20, 30, 40, 25, 27):  # after 40 the run is taken up again at 20
