@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -168,6 +168,36 @@ class FollowObject:
                 "the auxiliary reward 'sldr' needs the object's networks beside the predictor; "
                 f"give those of the same object stage ({OBJECT_FILE}), or neither"
             )
+
+    @classmethod
+    def from_preset(
+        cls,
+        env_id: str,
+        *,
+        method: str = "fo",
+        preset: str = "default",
+        seed: int = 0,
+        overrides: Mapping[str, Any] | None = None,
+        **arguments: Any,
+    ) -> FollowObject:
+        """Return one with the settings that `sb3-follow-object train` takes for a task.
+
+        Args:
+            env_id: the task.
+            method: one of `METHODS`.
+            preset: "default", what was measured to be best, or "paper", the authors' settings.
+            seed: decides the whole run.
+            overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win. Those
+                of a run folder (n_timesteps, eval_every and the like) mean nothing here.
+            **arguments: of the class, which are no settings: predictor, object_networks, report.
+
+        Raises:
+            ValueError: an id, a key or a value that cannot be meant, with the nearest that can.
+        """
+        from .config import run_config  # which needs this class
+
+        config = run_config(env_id, method=method, preset=preset, seed=seed, overrides=overrides)
+        return cls(env_id, seed=seed, **config.settings, **arguments)
 
     @property
     def has_object_stage(self) -> bool:

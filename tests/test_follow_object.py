@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 
+from sb3_follow_object.config import run_config
 from sb3_follow_object.envs import make_vec, physics_id
 from sb3_follow_object.experiment import RunConfig, evaluate, train
 from sb3_follow_object.follow_object import FollowObject, stream_seed
@@ -185,3 +187,21 @@ def test_object_on_table_stays_on_the_table() -> None:
 def test_streams_of_a_run_are_unrelated() -> None:
     seeds = [stream_seed(seed, name) for seed in range(50) for name in ("robot", "final test")]
     assert len(set(seeds)) == len(seeds)
+
+
+@pytest.mark.parametrize("method", ["her", "shaped"])
+def test_preset_learns_what_the_run_folder_learns(method: str, tmp_path: Path) -> None:
+    small = {"n_envs": 2, "n_threads": 1, "batch_size": 16, "gradient_steps": 2}
+    small |= {"learning_starts": 200, "policy_kwargs.net_arch": [8]}
+    config = run_config(ENV, method=method, seed=5, overrides=small)
+    train(replace(config, total_timesteps=600, n_final_episodes=1), tmp_path / "run", report=print)
+    run = FollowObject.from_preset(ENV, method=method, seed=5, overrides=small)
+    run.learn(600)
+    run.save_policy(tmp_path / "policy.safetensors")
+    ours, theirs = tmp_path / "policy.safetensors", tmp_path / "run" / "last_policy.safetensors"
+    assert ours.read_bytes() == theirs.read_bytes()
+
+
+def test_preset_refuses_what_train_refuses() -> None:
+    with pytest.raises(ValueError, match="did you mean 'batch_size'"):
+        FollowObject.from_preset(ENV, overrides={"batchsize": 3})
