@@ -295,8 +295,9 @@ class BatchVecEnv(_GoalFace, VecEnv):
 def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     difference = np.asarray(first) - np.asarray(second)
     # Coordinate by coordinate: the sums of linalg.norm(axis=-1) in a sixth of its time.
-    squares = sum(x * x for x in np.moveaxis(difference, -1, 0))
-    return np.asarray(np.sqrt(squares))
+    coordinates = np.moveaxis(difference, -1, 0)
+    squares = np.multiply(coordinates, coordinates, order="C")
+    return np.asarray(np.sqrt(squares.sum(axis=0)))
 
 
 def _spaces(simulation: BatchedSimulation) -> tuple[spaces.Dict, spaces.Box]:

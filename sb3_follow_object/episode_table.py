@@ -85,8 +85,8 @@ class EpisodeTable:
             length = self.length.astype(np.float64)
             weight = length * self.priority if by_priority else length
             rows = np.flatnonzero(weight > 0)
-            total = int(length[rows].sum())
-            self._draw_lists[by_priority] = _DrawList(rows, np.cumsum(weight[rows]), total)
+            ends = np.cumsum(weight[rows])
+            self._draw_lists[by_priority] = _DrawList(rows, ends, self.length[rows])
         return self._draw_lists[by_priority]
 
     def n_transitions(self, with_priority: bool = False) -> int:
@@ -102,6 +102,8 @@ class EpisodeTable:
         """
         episodes = self.draw_list(by_priority)
         row = episodes.at(rng.random(n) * episodes.ends[-1])
+        if episodes.same_length:  # the same numbers in a third of the time
+            return row, rng.integers(episodes.same_length, size=n)
         return row, rng.integers(self.facts.take(row, axis=0)[:, 2])
 
 
@@ -111,13 +113,18 @@ class _DrawList:
     Args:
         rows: of the table, (m,).
         ends: where each ends, (m,), the running sum of the weights.
+        length: their steps, (m,).
+
+    Attributes:
         n_transitions: in all of them.
+        same_length: the steps of each if all have as many, else 0.
     """
 
-    def __init__(self, rows: np.ndarray, ends: np.ndarray, n_transitions: int) -> None:
+    def __init__(self, rows: np.ndarray, ends: np.ndarray, length: np.ndarray) -> None:
         self.rows = rows.astype(np.int32)
         self.ends = ends
-        self.n_transitions = n_transitions
+        self.n_transitions = int(length.sum())
+        self.same_length = int(length[0]) if len(length) and np.ptp(length) == 0 else 0
         self._guide: np.ndarray | None = None
 
     def at(self, points: np.ndarray) -> np.ndarray:
