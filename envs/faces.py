@@ -293,11 +293,10 @@ class BatchVecEnv(_GoalFace, VecEnv):
 
 
 def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    difference = np.asarray(first) - np.asarray(second)
+    first, second = np.asarray(first), np.asarray(second)
     # Coordinate by coordinate: the sums of linalg.norm(axis=-1) in a sixth of its time.
-    coordinates = np.moveaxis(difference, -1, 0)
-    squares = np.multiply(coordinates, coordinates, order="C")
-    return np.asarray(np.sqrt(squares.sum(axis=0)))
+    squares = [np.square(first[..., i] - second[..., i]) for i in range(first.shape[-1])]
+    return np.asarray(np.sqrt(sum(squares[1:], start=squares[0])))
 
 
 def _spaces(simulation: BatchedSimulation) -> tuple[spaces.Dict, spaces.Box]:

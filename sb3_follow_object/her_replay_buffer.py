@@ -316,12 +316,14 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
             kept = np.flatnonzero(far)
             virtual, steps = virtual.take(kept), steps.take(kept)
             goals = goals.take(kept, axis=0)
+        goals = self._goals_in(goals)
         if self.imagined_ratio > 0.0:
             chosen = np.flatnonzero(self.rng.random(len(virtual)) < self.imagined_ratio)
             goals[chosen] = self._imagined_goals(episode[virtual[chosen]])
             steps[chosen] = np.inf
         steps_to_goal[virtual] = steps
-        rewards = self._reward(achieved.take(virtual, axis=0), goals, flat.take(virtual))
+        reached = self._goals_in(achieved.take(virtual, axis=0))
+        rewards = self._reward(reached, goals, flat.take(virtual))
         # Last, as it drives all else out of the cache.
         batch = self._gather(flat, achieved)
         batch.rewards[virtual] = rewards
@@ -371,7 +373,7 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
     def _hindsight_goals(
         self, episode: np.ndarray, step: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Achieved goals of the same episode, by the goal selection strategy (n, d).
+        """Achieved goals of the same episode, by the goal selection strategy, not yet cut to (n, d).
 
         Second, the steps from the transition to the one that achieved the goal (n,), float;
         infinite for goals of the past. Third, if that matters, whether the goal lies far enough
