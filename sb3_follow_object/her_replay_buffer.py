@@ -373,7 +373,7 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
     def _hindsight_goals(
         self, episode: np.ndarray, step: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Achieved goals of the same episode, by the goal selection strategy, not yet cut to (n, d).
+        """Achieved goals of the same episode, by the strategy, not yet cut to (n, d).
 
         Second, the steps from the transition to the one that achieved the goal (n,), float;
         infinite for goals of the past. Third, if that matters, whether the goal lies far enough
