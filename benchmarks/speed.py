@@ -130,7 +130,7 @@ def throughput(out: Path) -> list[dict[str, float]]:
             rates.append(median(measure() for _ in range(3)))
             env.close()
             rows.append({"n_envs": n_envs, "n_threads": n_threads, "steps_per_s": rates[-1]})
-        axes.plot(copies, rates, marker="o", label=f"{n_threads} threads")
+        axes.plot(copies, rates, marker="o", label=f"{n_threads} thread{'s' * (n_threads > 1)}")
     axes.set(xscale="log", xlabel="copies (n_envs)", ylabel="env steps/s", ylim=(0, None))
     axes.set_xticks(copies, [str(n) for n in copies])
     axes.legend()
