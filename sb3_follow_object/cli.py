@@ -352,6 +352,7 @@ def _compare(args: argparse.Namespace) -> None:
     from .compare import Comparison, cores, share_cores, write_report
     from .config import parse_override
     from .executors import Executor, LocalExecutor
+    from .files import lock
     from .grid import LOGS, Settings, plan
     from .grid_display import GridDisplay
 
@@ -368,7 +369,8 @@ def _compare(args: argparse.Namespace) -> None:
 
         jobs, threads = share_cores(connect(args.ray), n_runs, args.jobs, args.threads or 1)
         executor = RayExecutor(jobs)
-    with GridDisplay(quiet=args.quiet) as display:
+    args.out.mkdir(parents=True, exist_ok=True)
+    with lock(args.out, wait=False), GridDisplay(quiet=args.quiet) as display:
         comparison = Comparison(
             args.out, plan(*grid, threads), settings, executor, threads, display, args.retry_failed
         )

@@ -19,6 +19,7 @@ from sb3_follow_object.compare import Comparison, share_cores
 from sb3_follow_object.cross import CROSS_TESTS
 from sb3_follow_object.executors import LocalExecutor, Message
 from sb3_follow_object.experiment import OBJECT_STAGE, POLICY, RESULT
+from sb3_follow_object.files import lock
 from sb3_follow_object.grid import Cell, Settings, plan, read_grid
 from sb3_follow_object.grid_display import GridDisplay
 from sb3_follow_object.worker import CROSS, STAGE, TRAIN, Job
@@ -297,3 +298,6 @@ def test_real_run_is_stopped_resumed_and_ends(
     assert result["command"].startswith(f"sb3-follow-object train --run {run} --env")
     assert cli.main([*words, "--steps", "700"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+    with lock(tmp_path, wait=False):
+        assert cli.main(words) == 2
+    assert f"another process works in {tmp_path}" in capsys.readouterr().err
