@@ -19,9 +19,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from .callbacks import OriginalGoalEvalCallback
 from .envs import make_vec, object_id
 from .files import atomic_write, lock, remove_half_written
-from .follow_object import FollowObject, Report
+from .follow_object import FollowObject
 from .her_ddpg import HerDDPG
 from .object_policy import StopWhenSolved
+from .object_stage import Report
 from .policies import load_actor
 from .rollout import Episodes, run_episodes
 from .run_callbacks import CheckpointCallback, Progress, RunCallback, StopSignals
@@ -233,7 +234,8 @@ def _object_stage(
             stop,
         )
 
-    learn = run.learn_predictor if run.imagine else run.learn_object
+    stage = run.object_stage
+    learn = stage.learn_predictor if run.imagine else stage.learn_policy
     state = None if saved is None else saved["object"]
     learn(writer, state, between_epochs=stop.check, networks=shared)
     save_object_stage(folder, run, wall_s())
@@ -304,7 +306,9 @@ def _check_algorithms(run: FollowObject) -> None:
         envs.append((object_env, settings["object_algorithm"]))
     for env, arguments in envs:
         arguments = copy.deepcopy(arguments)
-        if run.uses_networks:  # what it needs is not there yet; its settings have been checked
+        if (
+            run.object_stage.needs_networks
+        ):  # what it needs is not there yet; its settings have been checked
             arguments.pop("auxiliary", None)
         replay = {**(arguments.get("replay_buffer_kwargs") or {}), "imagined_ratio": 0.0}
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +16,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from .callbacks import CurriculumCallback
 from .checkpoint import load_tree, save_tree
 from .curriculum import Curriculum
-from .envs import IDS, make_vec, object_id, physics_id
+from .envs import IDS, make_vec
 from .files import atomic_write
 from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
 from .keywords import check_keywords
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
-from .object_policy import (
-    StopWhenSolved,
-    collect_paths,
-    keeps_object_on_table,
-    train_object_policy,
-)
+from .object_stage import ObjectStage, Report
 from .policies import save_actor
 from .resuming import (
     FreshEpisodes,
@@ -41,8 +36,6 @@ from .resuming import (
 from .seeds import stream_seed
 from .sldr import reads_object_networks
 from .wrappers import ImaginedGoalVecEnv
-
-Report = Callable[[str], None]
 
 
 class FollowObject:
@@ -79,10 +72,8 @@ class FollowObject:
         report: called with a sentence as stages begin and end.
 
     Attributes:
+        object_stage: the first two stages, what they learned and what they cost.
         model: the robot's `HerDDPG`, once the third stage has begun.
-        predictor: F_phi, once the second stage has ended.
-        object_steps: env steps that the first two stages cost.
-        policy_steps: those of the first one, the object policy's, where it was run here.
 
     Raises:
         ValueError: unknown task, a predictor made for another one, or an argument out of range.
@@ -144,26 +135,27 @@ class FollowObject:
         ):
             check_keywords(name, given or {}, function)
         ObjectNetworks.check_fit(**self.settings["inverse_fit"])
-        self.uses_networks = reads_object_networks(algorithm or {})
         self.env_id = env_id
         self.imagine = imagine
         self.seed = seed
         self.report = report or (lambda sentence: None)
+        self.object_stage = ObjectStage(
+            env_id,
+            self.settings,
+            seed,
+            self.report,
+            needs_networks=reads_object_networks(algorithm or {}),
+        )
         self.env: VecEnv = self._robot_env("robot")
         self.horizon = int(self.env.get_attr("spec", indices=[0])[0].max_episode_steps)
         self.curriculum = Curriculum(self.horizon, **self.settings["curriculum"])
         self.model: HerDDPG | None = None
         self.curriculum_callback: CurriculumCallback | None = None
-        self.predictor: GoalPredictor | None = None
-        self.object_steps = self.policy_steps = 0
-        self.object_success = float("nan")
-        self.object_networks: ObjectNetworks | None = None
         if predictor is not None:
-            self.use_predictor(predictor)
+            self.object_stage.use_predictor(predictor)
         if object_networks is not None:
-            object_networks.check(env_id, physics_id(env_id), "the object_networks given")
-            self.object_networks = object_networks
-        elif self.uses_networks and predictor is not None:
+            self.object_stage.use_networks(object_networks)
+        elif self.object_stage.needs_networks and predictor is not None:
             raise ValueError(
                 "the auxiliary reward 'sldr' needs the object's networks beside the predictor; "
                 f"give those of the same object stage ({OBJECT_FILE}), or neither"
@@ -202,114 +194,17 @@ class FollowObject:
     @property
     def has_object_stage(self) -> bool:
         """Whether the object learns first, for imagined goals or for SLDR."""
-        return self.imagine or self.uses_networks
+        return self.imagine or self.object_stage.needs_networks
 
-    # ---- stages one and two -------------------------------------------------------------------
+    @property
+    def predictor(self) -> GoalPredictor | None:
+        """F_phi, once the second stage has ended."""
+        return self.object_stage.predictor
 
-    def use_predictor(self, predictor: GoalPredictor) -> None:
-        """Take an F_phi that was made before.
-
-        Raises:
-            ValueError: it was made for another task, for other physics, or from an object that
-                was kept on the table where this one's is not, or the other way round.
-        """
-        if predictor.env_id != self.env_id or predictor.physics != physics_id(self.env_id):
-            raise ValueError(
-                f"the predictor was made for {predictor.env_id} (physics {predictor.physics}), "
-                f"not for {self.env_id} (physics {physics_id(self.env_id)}); make a new one"
-            )
-        on_table = self._object_on_table()
-        if predictor.object_on_table not in (None, on_table):
-            raise ValueError(
-                f"the predictor was made with object_on_table={predictor.object_on_table}, "
-                f"not {on_table}; make a new one"
-            )
-        self.predictor = predictor
-
-    def learn_object(
-        self,
-        callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
-        state: dict[str, Any] | None = None,
-        between_epochs: Callable[[], None] = lambda: None,
-        networks: bool = False,
-    ) -> tuple[HerDDPG, StopWhenSolved]:
-        """Run stage one (section 4.1): the object policy, and with SLDR the networks that it needs.
-
-        Args:
-            callback: makes a callback from the one that tests the object's policy.
-            state: of that one; stage one goes on exactly from there.
-            between_epochs: called while the inverse model is fitted; may raise to stop.
-            networks: whether to make what SLDR needs for others, though this run does not.
-        """
-        settings = self.settings
-        self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
-        env, test_env = (self._object_env(name) for name in ("object", "object_test"))
-        model, solved = train_object_policy(
-            env,
-            test_env,
-            settings["object_timesteps"],
-            seed=stream_seed(self.seed, "object"),
-            report=lambda steps, rate: self.report(f"  {steps:>7} steps: success {rate:.2f}"),
-            callback=callback,
-            state=state,
-            **settings["object_algorithm"],
-        )
-        self.object_steps = self.policy_steps = model.num_timesteps
-        if networks or self.uses_networks:
-            self.object_networks = ObjectNetworks.learned(
-                model,
-                self.env_id,
-                physics_id(self.env_id),
-                seed=stream_seed(self.seed, "inverse"),
-                between_updates=between_epochs,
-                **settings["inverse_fit"],
-            )
-            error = self.object_networks.inverse_error
-            self.report(f"  {self.object_steps} env steps, inverse model's error {error:.3f}")
-        env.close()
-        test_env.close()
-        self.object_success = solved.rates[-1] if solved.rates else float("nan")
-        return model, solved
-
-    def learn_predictor(
-        self,
-        callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
-        state: dict[str, Any] | None = None,
-        between_epochs: Callable[[], None] = lambda: None,
-        networks: bool = False,
-    ) -> GoalPredictor:
-        """Run stages one and two: object policy, then F_phi (sections 4.1 and 4.2).
-
-        Args:
-            callback: as in `learn_object`.
-            state: as in `learn_object`.
-            between_epochs: called while F_phi and the inverse model are fitted; may raise to stop.
-            networks: as in `learn_object`.
-        """
-        settings = self.settings
-        model, solved = self.learn_object(callback, state, between_epochs, networks)
-        env = self._object_env("paths")
-        paths = collect_paths(model, env, settings["n_paths"])
-        env.close()
-        self.object_steps += paths.env_steps
-        self.object_success = paths.success_rate
-        self.report(
-            f"  {self.object_steps} env steps, noise-free success {paths.success_rate:.2f}"
-            + ("" if solved.solved else " (not solved: its imagined goals may mislead)")
-        )
-        self.report("stage 2: F_phi learns to imagine goals")
-        self.predictor = GoalPredictor.fit(
-            paths.positions,
-            paths.goals,
-            env_id=self.env_id,
-            physics=physics_id(self.env_id),
-            object_on_table=self._object_on_table(),
-            seed=stream_seed(self.seed, "predictor"),
-            progress=lambda epoch, loss: between_epochs(),
-            **settings["predictor_fit"],
-        )
-        self.report(f"  held-out error {float(np.mean(self.predictor.error_mm)):.1f} mm")
-        return self.predictor
+    @property
+    def object_steps(self) -> int:
+        """Env steps that the first two stages cost."""
+        return self.object_stage.steps
 
     # ---- stage three --------------------------------------------------------------------------
 
@@ -328,7 +223,7 @@ class FollowObject:
         if self.model is not None:
             return self.model
         if self.imagine:
-            predictor = self.predictor or self.learn_predictor()
+            predictor = self.predictor or self.object_stage.learn_predictor()
             test_env = self._robot_env("test")
             self.env = ImaginedGoalVecEnv(self.env, predictor, self.curriculum)
             test_env = ImaginedGoalVecEnv(test_env, predictor, self.curriculum, mode="test")
@@ -340,10 +235,11 @@ class FollowObject:
                 store=self.settings["store_tests"],
             )
         arguments: dict[str, Any] = {"policy": "MultiInputPolicy", **self.settings["algorithm"]}
-        if self.uses_networks:
-            if self.object_networks is None:
-                self.learn_object()
-            networks = {"object_networks": self.object_networks}
+        stage = self.object_stage
+        if stage.needs_networks:
+            if stage.networks is None:
+                stage.learn_policy()
+            networks = {"object_networks": stage.networks}
             arguments["auxiliary"] = {**arguments["auxiliary"], **networks}
         self.model = HerDDPG(env=self.env, seed=stream_seed(self.seed, "networks"), **arguments)
         # SB3 seeds the environment too; a run's streams are its own.
@@ -401,7 +297,7 @@ class FollowObject:
         """Return what `learn` has changed, at an episode's end of every copy."""
         state: dict[str, Any] = {
             "object_steps": self.object_steps,
-            "object_success": self.object_success,
+            "object_success": self.object_stage.success,
             "curriculum": self.curriculum.state_dict(),
         }
         if self.model is not None:
@@ -418,8 +314,8 @@ class FollowObject:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`; the predictor must have been given already."""
-        self.object_steps = state["object_steps"]
-        self.object_success = state["object_success"]
+        self.object_stage.steps = state["object_steps"]
+        self.object_stage.success = state["object_success"]
         self.curriculum.load_state_dict(state["curriculum"])
         if "model" not in state:
             return
@@ -447,8 +343,9 @@ class FollowObject:
         folder.mkdir(parents=True, exist_ok=True)
         if self.predictor is not None and not (folder / "predictor").exists():
             self.predictor.save(folder / "predictor")
-        if self.object_networks is not None and not (folder / OBJECT_FILE).exists():
-            self.object_networks.save(folder / OBJECT_FILE)
+        networks = self.object_stage.networks
+        if networks is not None and not (folder / OBJECT_FILE).exists():
+            networks.save(folder / OBJECT_FILE)
         save_tree(folder / "state.safetensors", self.state_dict(replay_buffer))
         atomic_write(folder / "settings.json", json.dumps(self.settings, indent=2).encode())
 
@@ -495,18 +392,5 @@ class FollowObject:
             else {"reward_type": reward_type}
         )
         env = make_vec(self.env_id, self.settings["n_envs"], self.settings["n_threads"], **options)
-        env.seed(stream_seed(self.seed, purpose))
-        return env
-
-    def _object_on_table(self) -> bool:
-        return keeps_object_on_table(self.env_id, self.settings["object_on_table"])
-
-    def _object_env(self, purpose: str) -> VecEnv:
-        env = make_vec(
-            object_id(self.env_id),
-            self.settings["object_n_envs"],
-            self.settings["n_threads"],
-            on_table=self._object_on_table(),
-        )
         env.seed(stream_seed(self.seed, purpose))
         return env

@@ -9,11 +9,12 @@ from pathlib import Path
 from .config import run_config
 from .envs import physics_id
 from .files import lock
-from .follow_object import FollowObject, Report
+from .follow_object import FollowObject
 from .goal_predictor import FACTS_FILE, GoalPredictor
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
 from .object_policy import keeps_object_on_table
+from .object_stage import Report
 from .run_folder import RunConfig
 
 CACHE_VARIABLE = "SB3_FOLLOW_OBJECT_CACHE"
@@ -66,12 +67,12 @@ def learn_predictor(
         config.env_id, seed=config.seed, report=report, **{**config.settings, "n_envs": 1}
     )
     try:
-        predictor = run.learn_predictor(networks=True)
+        predictor = run.object_stage.learn_predictor(networks=True)
     finally:
         run.close()
-    assert run.object_networks is not None
+    assert run.object_stage.networks is not None
     predictor.save(folder)
-    run.object_networks.save(Path(folder) / OBJECT_FILE)
+    run.object_stage.networks.save(Path(folder) / OBJECT_FILE)
     return predictor
 
 

@@ -16,10 +16,11 @@ from typing import Any
 from .checkpoint import Camera, Snapshot, load_tree
 from .envs import physics_id
 from .files import LOCK, atomic_write
-from .follow_object import FollowObject, Report
+from .follow_object import FollowObject
 from .goal_predictor import FACTS_FILE, GoalPredictor
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
+from .object_stage import Report
 
 CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
 PREDICTOR, OBJECT_STAGE = "predictor", "object_stage.json"
@@ -206,14 +207,15 @@ def trained_steps(folder: str | os.PathLike[str]) -> int | None:
 
 def save_object_stage(folder: Path, run: FollowObject, wall_s: float) -> None:
     """Keep what the object stage made and what it cost; the last file says that all are there."""
-    if run.object_networks is not None:
-        run.object_networks.save(folder / OBJECT_FILE)
-    if run.predictor is not None:
-        run.predictor.save(folder / PREDICTOR)
+    stage = run.object_stage
+    if stage.networks is not None:
+        stage.networks.save(folder / OBJECT_FILE)
+    if stage.predictor is not None:
+        stage.predictor.save(folder / PREDICTOR)
     facts = {
-        "object_steps": run.object_steps,
-        "policy_steps": run.policy_steps,
-        "object_success": run.object_success,
+        "object_steps": stage.steps,
+        "policy_steps": stage.policy_steps,
+        "object_success": stage.success,
         "wall_s": round(wall_s, 1),
     }
     atomic_write(folder / OBJECT_STAGE, json.dumps(facts).encode())
@@ -235,6 +237,7 @@ def load_object_stage(folder: Path, run: FollowObject, saved: Any) -> float | No
     """
     if not run.has_object_stage:
         return 0.0
+    stage = run.object_stage
     path = folder / OBJECT_STAGE
     robot_has_begun = isinstance(saved, dict) and saved.get("stage") == "robot"
     if not path.exists() and not robot_has_begun:
@@ -242,7 +245,7 @@ def load_object_stage(folder: Path, run: FollowObject, saved: Any) -> float | No
     for needed, file, purpose in (
         (True, path, "says what it cost"),
         (run.imagine, folder / PREDICTOR / FACTS_FILE, "the robot's goals come from"),
-        (run.uses_networks, folder / OBJECT_FILE, "SLDR's reward reads"),
+        (stage.needs_networks, folder / OBJECT_FILE, "SLDR's reward reads"),
     ):
         if needed and not file.exists():
             raise ValueError(
@@ -250,15 +253,15 @@ def load_object_stage(folder: Path, run: FollowObject, saved: Any) -> float | No
                 "put it back, or start another run"
             )
     if run.imagine:
-        run.use_predictor(GoalPredictor.load(folder / PREDICTOR, env_id=run.env_id))
-    if run.uses_networks:
+        stage.use_predictor(GoalPredictor.load(folder / PREDICTOR, env_id=run.env_id))
+    if stage.needs_networks:
         physics = physics_id(run.env_id)
-        run.object_networks = ObjectNetworks.load(folder / OBJECT_FILE, run.env_id, physics)
+        stage.networks = ObjectNetworks.load(folder / OBJECT_FILE, run.env_id, physics)
     try:
         facts = json.loads(path.read_text())
         # A stage that other runs share may have more than this one uses.
-        run.object_steps = int(facts["object_steps" if run.imagine else "policy_steps"])
-        run.object_success = float(facts["object_success"])
+        stage.steps = int(facts["object_steps" if run.imagine else "policy_steps"])
+        stage.success = float(facts["object_success"])
         return float(facts["wall_s"])
     except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} does not say what the object stage cost ({error})") from error

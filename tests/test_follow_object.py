@@ -13,8 +13,9 @@ import torch as th
 from sb3_follow_object.config import run_config
 from sb3_follow_object.envs import make_vec, physics_id
 from sb3_follow_object.experiment import RunConfig, evaluate, train
-from sb3_follow_object.follow_object import FollowObject, stream_seed
+from sb3_follow_object.follow_object import FollowObject
 from sb3_follow_object.goal_predictor import GoalPredictor
+from sb3_follow_object.seeds import stream_seed
 
 ENV = "FollowObject/PushSideGap-v0"
 SMALL_NET = {"batch_size": 32, "gradient_steps": 2, "policy_kwargs": {"net_arch": [16, 16]}}
@@ -35,7 +36,7 @@ STEPS_AFTER_OBJECT = 1200
 @pytest.fixture(scope="module")
 def predictor() -> GoalPredictor:
     run = FollowObject(ENV, **TINY)
-    made = run.learn_predictor()
+    made = run.object_stage.learn_predictor()
     assert run.object_steps >= 1600
     run.close()
     return made
