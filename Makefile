@@ -25,7 +25,7 @@ test: lint
 test-mujoco-range: $(INSTALLED)
 	$(BIN)/pytest -q -m mujoco_range
 
-# Against stock SB3, Gymnasium-Robotics and EnvPool; a quarter of an hour on a machine left alone.
+# Against stock SB3, Gymnasium-Robotics and EnvPool; two minutes on a machine left alone.
 bench: $(INSTALLED)
 	$(BIN)/pip install -c constraints.txt -e '.[bench]' --no-build-isolation
 	$(BIN)/python benchmarks/speed.py
