@@ -22,7 +22,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import runs
+import tiny_runs as runs
 
 # What a run prints as each part of its life begins.
 PARTS = {
@@ -36,7 +36,7 @@ WRITING = "a checkpoint's writing"
 ANYWHERE = "anywhere"
 KINDS = (*PARTS, WRITING, ANYWHERE)
 CODE = """
-import sys, runs
+import sys, tiny_runs as runs
 from pathlib import Path
 from sb3_follow_object.experiment import train
 folder = Path(sys.argv[1])

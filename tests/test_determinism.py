@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import runs
+import tiny_runs as runs
 
 
 def outcome(folder: Path, seed: int = 0, **settings: Any) -> dict[str, Any]:

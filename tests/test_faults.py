@@ -6,6 +6,9 @@ import errno
 import multiprocessing
 import os
 import resource
+import shutil
+import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-import runs
+import tiny_runs as runs
 
 from sb3_follow_object.checkpoint import load_tree
 from sb3_follow_object.cli import main
@@ -213,6 +216,36 @@ def test_full_disk_leaves_the_last_good_checkpoint(tmp_path: Path) -> None:
 
 def refuse(*argv: object) -> int:
     return main([str(word) for word in argv])
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of its own with room for 3 MB."""
+    mount = ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(tmp_path)]
+    try:
+        allowed = subprocess.run(mount, capture_output=True).returncode == 0
+    except OSError:
+        allowed = False
+    if not allowed:
+        pytest.skip("a file system cannot be mounted here")
+    yield tmp_path
+    subprocess.run(["umount", "--lazy", str(tmp_path)], check=True)  # logs are open
+
+
+def test_run_on_a_full_disk_ends_in_a_sentence_and_resumes(small_disk: Path) -> None:
+    folder, filler = small_disk / "run", small_disk / "filler"
+    told = []
+
+    def fill_at_3000(sentence: str) -> None:
+        told.append(sentence)
+        if sentence.startswith("checkpoint at 3000"):
+            filler.write_bytes(bytes(shutil.disk_usage(small_disk).free - 4096))
+
+    with pytest.raises(RuntimeError, match=r"No space left.* resumed from checkpoint-0*3000\."):
+        train(runs.config(), folder, report=fill_at_3000)
+    assert any("3400 env steps could not be written (No space left" in line for line in told)
+    filler.unlink()
+    assert runs.run(folder, resume=True)["env_steps"] == 3600
 
 
 def test_output_that_cannot_be_written_is_one_sentence(

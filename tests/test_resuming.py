@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import runs
+import tiny_runs as runs
 import torch as th
 
 from sb3_follow_object.checkpoint import load_tree, save_tree
@@ -298,7 +298,7 @@ def test_killed_runs_resume(whole: dict[str, Any], tmp_path: Path) -> None:
         lambda: (folder / "policy.safetensors").exists(),
     ]
     for again, mark in enumerate(marks):
-        code = "import sys, runs; from pathlib import Path; "
+        code = "import sys, tiny_runs as runs; from pathlib import Path; "
         code += f"runs.run(Path(sys.argv[1]), resume={again > 0})"
         process = subprocess.Popen(
             [sys.executable, "-c", code, str(folder)], cwd=Path(__file__).parent
