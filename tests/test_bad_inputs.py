@@ -14,7 +14,7 @@ import yaml
 from sb3_follow_object import experiment
 from sb3_follow_object.cli import main
 from sb3_follow_object.config import run_config
-from sb3_follow_object.follow_object import FollowObject
+from sb3_follow_object.object_stage import ObjectStage
 
 TASK = "FollowObject/PushSideGap-v0"
 CASES = yaml.safe_load(Path(__file__).with_name("bad_inputs.yaml").read_text())
@@ -39,7 +39,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         raise AssertionError("the input was accepted")  # rather than trained for hours
 
     monkeypatch.setattr(experiment, "_run_stages", accepted)
-    monkeypatch.setattr(FollowObject, "learn_predictor", accepted)
+    monkeypatch.setattr(ObjectStage, "learn_predictor", accepted)
     return tmp_path
 
 
