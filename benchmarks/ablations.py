@@ -2,7 +2,8 @@
 
     python benchmarks/ablations.py runs/ab-*
 
-Writes benchmarks/ablations.csv: a row a run with what differs, when the curriculum passed each
+Writes benchmarks/ablations.csv, where a row of the same task, seed and setting is replaced and the
+others stay: a row a run with what differs, when the curriculum passed each
 fifth of its levels, when 0.9 of the validation episodes first succeeded, and the final test. Prints
 it as Markdown. Runs need not be finished: the final test is then empty.
 """
@@ -65,7 +66,7 @@ def read_row(run: Path) -> dict[str, Any]:
         levels = 50
     return {
         "task": config["env_id"].removeprefix("FollowObject/").removesuffix("-v0"),
-        "seed": config["seed"],
+        "seed": str(config["seed"]),
         "setting": difference(config),
         **{f"k_{share}": first("k_max", share / 100 * levels) for share in (20, 40, 60, 80, 100)},
         "validated_0.9": first("success_rate", 0.9),
@@ -80,8 +81,14 @@ def main() -> None:
     """Collect the runs named on the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("runs", nargs="+", type=Path)
+    kept: list[dict[str, Any]] = []
+    if OUT.exists():
+        with open(OUT, newline="") as file:
+            kept = list(csv.DictReader(file))
+    kept += [read_row(run) for run in parser.parse_args().runs]
+    by_run = {(row["task"], row["setting"], row["seed"]): row for row in kept}
     rows = sorted(
-        (read_row(run) for run in parser.parse_args().runs),
+        by_run.values(),
         key=lambda row: (row["task"], row["setting"] != "default", row["setting"], row["seed"]),
     )
     with open(OUT, "w", newline="") as file:

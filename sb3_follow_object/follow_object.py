@@ -140,11 +140,7 @@ class FollowObject:
         self.seed = seed
         self.report = report or (lambda sentence: None)
         self.object_stage = ObjectStage(
-            env_id,
-            self.settings,
-            seed,
-            self.report,
-            needs_networks=reads_object_networks(algorithm or {}),
+            self.settings, self.report, needs_networks=reads_object_networks(algorithm or {})
         )
         self.env: VecEnv = self._robot_env("robot")
         self.horizon = int(self.env.get_attr("spec", indices=[0])[0].max_episode_steps)

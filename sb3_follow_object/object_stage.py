@@ -28,9 +28,7 @@ class ObjectStage:
     """What a task's object learns alone (paper, sections 4.1 and 4.2).
 
     Args:
-        env_id: the robot's task.
-        settings: `FollowObject`'s; object_*, *_fit, n_paths and n_threads are read.
-        seed: decides the stage.
+        settings: `FollowObject`'s; env_id, seed, object_*, *_fit, n_paths and n_threads are read.
         report: called with a sentence as it goes on.
         needs_networks: whether SLDR's reward will read the object's networks.
 
@@ -44,15 +42,13 @@ class ObjectStage:
 
     def __init__(
         self,
-        env_id: str,
         settings: Mapping[str, Any],
-        seed: int,
         report: Report,
         needs_networks: bool,
     ):
-        self.env_id = env_id
         self.settings = settings
-        self.seed = seed
+        self.env_id: str = settings["env_id"]
+        self.seed: int = settings["seed"]
         self.report = report
         self.needs_networks = needs_networks
         self.predictor: GoalPredictor | None = None
