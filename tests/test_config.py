@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from sb3_follow_object.config import (
 )
 from sb3_follow_object.envs import IDS
 from sb3_follow_object.her_ddpg import HerDDPG
+from sb3_follow_object.run_folder import difference
 
 TASK = "FollowObject/PushSideGap-v0"
 ROBOTS = [env_id for env_id, (_, alone) in IDS.items() if not alone]
@@ -289,3 +291,16 @@ def test_damaged_configuration_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match="is not the configuration of a run"):
         load_config(tmp_path)
+
+
+def test_each_ablation_of_the_docs_changes_one_setting() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "compare.md").read_text()
+    section = text.split("## Ablations\n")[1].split("\n## ")[0]
+    settings = re.findall(r"`--set (\S+)` \|$", section, flags=re.MULTILINE)
+    assert len(settings) == 7
+    default = asdict(run_config(TASK))
+    for setting in settings:
+        changed = asdict(run_config(TASK, overrides=dict([parse_override(setting)])))
+        found = difference(default, changed)
+        assert found is not None, setting
+        assert found[0].endswith(setting.split("=")[0]), setting
