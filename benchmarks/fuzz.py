@@ -32,8 +32,9 @@ from stable_baselines3.td3.policies import Actor
 
 from sb3_follow_object.checkpoint import load_tree, save_tree
 from sb3_follow_object.config import load_config, preset_file, run_config
-from sb3_follow_object.goal_predictor import FACTS_FILE, TENSORS_FILE, GoalPredictor
+from sb3_follow_object.goal_predictor import GoalPredictor
 from sb3_follow_object.policies import NormalizedGoalExtractor, load_actor, save_actor
+from sb3_follow_object.predictor_files import FACTS_FILE, TENSORS_FILE
 from sb3_follow_object.run_folder import CONFIG
 
 TASK = "FollowObject/PushSideGap-v0"

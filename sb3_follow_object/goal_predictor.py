@@ -8,30 +8,30 @@ import os
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import safetensors.torch
 import torch
-from safetensors import SafetensorError
 from torch import nn
 
 from .files import atomic_write
+from .predictor_files import (
+    FACTS_FILE,
+    FORMAT,
+    INPUTS,
+    LAYERS_LIMIT,
+    POSITION,
+    SCALES,
+    TENSORS_FILE,
+    WIDTH_LIMIT,
+    checked_facts,
+    checked_tensors,
+    valid_hidden,
+)
 
-POSITION = 3  # coordinates of an object position
-INPUTS = 2 * POSITION + 1  # o_1, g, k
 # Metres. The start's height is the same in all paths up to the solver's noise; divided by that
 # noise, half a millimetre in the robot's scene would be an input that the network has never seen.
 SMALLEST_STD = 1e-2
-
-TENSORS_FILE = "predictor.safetensors"
-FACTS_FILE = "predictor.json"
-FORMAT = 1
-FACTS_LIMIT = 1 << 20  # bytes
-HEADER_LIMIT = 1 << 20  # bytes that a tensors file may hold beside the numbers
-LAYERS_LIMIT = 16
-WIDTH_LIMIT = 8192
-HORIZON_LIMIT = 100_000
 
 Progress = Callable[[int, float], None]
 
@@ -69,11 +69,11 @@ class GoalPredictor:
         self._tensors = tensors
         self._network = _network(self.hidden)
         self._network.load_state_dict(
-            {name: value for name, value in tensors.items() if name not in _scales()}
+            {name: value for name, value in tensors.items() if name not in SCALES}
         )
         self._network.eval()
         # Copies: torch moves a tensor's memory when it is sent to another process.
-        self._scales = {name: tensors[name].numpy().copy() for name in _scales()}
+        self._scales = {name: tensors[name].numpy().copy() for name in SCALES}
 
     @classmethod
     def fit(
@@ -250,7 +250,7 @@ class GoalPredictor:
                 another task, other physics or another object_on_table.
         """
         folder = Path(folder)
-        facts = _checked_facts(folder / FACTS_FILE)
+        facts = checked_facts(folder / FACTS_FILE)
         wanted = {"env_id": env_id, "physics": physics}
         for name, value in wanted.items():
             if value is not None and facts[name] != value:
@@ -264,7 +264,7 @@ class GoalPredictor:
                 f"The predictor in {folder} was made with object_on_table={made}, "
                 f"not {object_on_table}: fit one with that setting."
             )
-        tensors = _checked_tensors(folder / TENSORS_FILE, facts["hidden"], facts["sha256"])
+        tensors = checked_tensors(folder / TENSORS_FILE, facts["hidden"], facts["sha256"])
         return cls(
             tensors,
             hidden=facts["hidden"],
@@ -330,16 +330,6 @@ def _train(
             progress(epoch, float(total) / len(inputs))
 
 
-def _scales() -> dict[str, int]:
-    """Return the names and lengths of the tensors that are not weights."""
-    return {
-        "input_mean": INPUTS,
-        "input_std": INPUTS,
-        "output_mean": POSITION,
-        "output_std": POSITION,
-    }
-
-
 def _checked_paths(paths: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     paths, goals = np.asarray(paths, dtype=np.float64), np.asarray(goals, dtype=np.float64)
     if paths.ndim != 3 or len(paths) < 2 or paths.shape[1] < 2 or paths.shape[2] != POSITION:
@@ -360,7 +350,7 @@ def _check_training(
     epochs: int,
     test_share: float,
 ) -> None:
-    if not _valid_hidden(list(hidden)):
+    if not valid_hidden(list(hidden)):
         raise ValueError(
             f"hidden must be 1 to {LAYERS_LIMIT} widths in 1..{WIDTH_LIMIT}, got {hidden!r}."
         )
@@ -370,78 +360,3 @@ def _check_training(
         raise ValueError(f"batch_size and epochs must be >= 1, got {batch_size!r} and {epochs!r}.")
     if not 0.0 < test_share < 1.0:
         raise ValueError(f"test_share must lie between 0 and 1, got {test_share!r}.")
-
-
-def _valid_hidden(hidden: Any) -> bool:
-    return (
-        isinstance(hidden, list)
-        and 1 <= len(hidden) <= LAYERS_LIMIT
-        and all(type(width) is int and 1 <= width <= WIDTH_LIMIT for width in hidden)
-    )
-
-
-def _read(path: Path, limit: int) -> bytes:
-    """Return the file's bytes, refusing a missing or oversized one before reading it."""
-    try:
-        size = path.stat().st_size
-        if size > limit:
-            raise ValueError(f"{path} has {size} bytes, more than the {limit} it can need.")
-        return path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"Cannot read {path} of a predictor: {error.strerror}.") from error
-
-
-def _checked_facts(path: Path) -> dict[str, Any]:
-    damaged = f"{path} is not the description of a predictor"
-    try:
-        facts = json.loads(_read(path, FACTS_LIMIT))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise ValueError(f"{damaged}: it is not JSON ({error}).") from error
-    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
-        raise ValueError(f"{damaged} of format {FORMAT}.")
-    for name in ("env_id", "physics", "sha256"):
-        if not isinstance(facts.get(name), str):
-            raise ValueError(f"{damaged}: {name} must be a string, got {facts.get(name)!r}.")
-    if not isinstance(facts.get("object_on_table"), bool | None):
-        raise ValueError(f"{damaged}: object_on_table must be true, false or null.")
-    horizon, errors = facts.get("horizon"), facts.get("error_mm")
-    if type(horizon) is not int or not 1 <= horizon <= HORIZON_LIMIT:
-        raise ValueError(f"{damaged}: horizon must lie in 1..{HORIZON_LIMIT}, got {horizon!r}.")
-    if not _valid_hidden(facts.get("hidden")):
-        raise ValueError(f"{damaged}: hidden is not a list of widths.")
-    if (
-        not isinstance(errors, list)
-        or len(errors) != horizon
-        or not all(type(error) in (int, float) and 0.0 <= error < np.inf for error in errors)
-    ):
-        raise ValueError(f"{damaged}: error_mm must be {horizon} finite numbers >= 0.")
-    return facts
-
-
-def _checked_tensors(path: Path, hidden: Sequence[int], sha256: str) -> dict[str, torch.Tensor]:
-    expected: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-        name: ((length,), torch.float64) for name, length in _scales().items()
-    }
-    widths = [INPUTS, *hidden, POSITION]
-    for layer, (n_in, n_out) in enumerate(pairwise(widths)):
-        # A ReLU stands between two linear layers, so these have the even places.
-        expected[f"{2 * layer}.weight"] = ((n_out, n_in), torch.float32)
-        expected[f"{2 * layer}.bias"] = ((n_out,), torch.float32)
-    limit = HEADER_LIMIT + sum(
-        int(np.prod(shape)) * dtype.itemsize for shape, dtype in expected.values()
-    )
-    data = _read(path, limit)
-    if hashlib.sha256(data).hexdigest() != sha256:
-        raise ValueError(f"{path} is damaged or belongs to another {FACTS_FILE}.")
-    try:
-        tensors = safetensors.torch.load(data)
-    except SafetensorError as error:
-        raise ValueError(f"{path} is not a safetensors file ({error}).") from error
-    found = {name: (tuple(value.shape), value.dtype) for name, value in tensors.items()}
-    if found != expected:
-        raise ValueError(f"{path} does not hold the tensors of hidden layers {list(hidden)}.")
-    if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
-        raise ValueError(f"{path} holds NaN or infinity.")
-    if not all(bool((tensors[name] > 0).all()) for name in ("input_std", "output_std")):
-        raise ValueError(f"{path} holds a standard deviation that is not positive.")
-    return tensors

@@ -13,9 +13,9 @@ from stable_baselines3.common.torch_layers import create_mlp, get_actor_critic_a
 from torch import nn
 
 from .checkpoint import load_tree, save_tree
-from .goal_predictor import LAYERS_LIMIT, WIDTH_LIMIT
 from .her_ddpg import HerDDPG
 from .policies import HerPolicy, NormalizedGoalExtractor
+from .predictor_files import LAYERS_LIMIT, WIDTH_LIMIT
 
 FILE = "object_networks.safetensors"
 FORMAT = 1

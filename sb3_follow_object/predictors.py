@@ -10,11 +10,12 @@ from .config import run_config
 from .envs import physics_id
 from .files import lock
 from .follow_object import FollowObject
-from .goal_predictor import FACTS_FILE, GoalPredictor
+from .goal_predictor import GoalPredictor
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
 from .object_policy import keeps_object_on_table
 from .object_stage import Report
+from .predictor_files import FACTS_FILE
 from .run_folder import RunConfig
 
 CACHE_VARIABLE = "SB3_FOLLOW_OBJECT_CACHE"

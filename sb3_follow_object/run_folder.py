@@ -17,10 +17,11 @@ from .checkpoint import Camera, Snapshot, load_tree
 from .envs import physics_id
 from .files import LOCK, atomic_write
 from .follow_object import FollowObject
-from .goal_predictor import FACTS_FILE, GoalPredictor
+from .goal_predictor import GoalPredictor
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
 from .object_stage import Report
+from .predictor_files import FACTS_FILE
 
 CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
 PREDICTOR, OBJECT_STAGE = "predictor", "object_stage.json"

@@ -19,8 +19,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from .curriculum import Curriculum
 from .envs import IDS, physics_id
-from .goal_predictor import POSITION, GoalPredictor
+from .goal_predictor import GoalPredictor
 from .imagination import draw_goals, imagine
+from .predictor_files import POSITION
 
 MODES = ("train", "test")
 SUCCESS_METHODS = ("is_success", "_is_success")  # ours, and gymnasium-robotics'

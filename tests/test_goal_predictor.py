@@ -11,7 +11,8 @@ import safetensors.torch
 import torch
 
 from sb3_follow_object.files import atomic_write
-from sb3_follow_object.goal_predictor import FACTS_FILE, TENSORS_FILE, GoalPredictor
+from sb3_follow_object.goal_predictor import GoalPredictor
+from sb3_follow_object.predictor_files import FACTS_FILE, TENSORS_FILE
 
 from . import toy
 
