@@ -25,6 +25,7 @@ WALL_TIME, FINAL_SUCCESS = "wall_time.png", "final_success.png"
 
 _HATCH = {"hatch": "///", "facecolor": "none", "edgecolor": "0.6", "linewidth": 0.0}
 _BASELINE = "her"  # the paper's HER-a and HER-b
+_SHADES = {"a": "0.35", "b": "0.7"}  # no method's colour: the bars name what they show
 
 
 def draw_results(
@@ -131,7 +132,7 @@ def _cross_panel(axis: Any, groups: Sequence[Group]) -> None:
             continue
         low, middle, high = quartiles(values)
         error = [[middle - low], [high - middle]]
-        axis.bar(place, middle, width=0.8, yerr=error, capsize=3, color=f"C{PAIR.index(trained)}")
+        axis.bar(place, middle, width=0.8, yerr=error, capsize=3, color=_SHADES[letter])
         axis.text(place, middle + 0.02, f"{middle:.2f}", ha="center")
     axis.set_xticks(range(len(labels)), labels, fontsize=7)
     axis.set_title("HER-a and HER-b", pad=16)
