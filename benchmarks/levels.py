@@ -2,9 +2,9 @@
 
     python benchmarks/levels.py benchmarks/results/PnPInsertion-fo-0 --levels 5 10 15 20 22 24
 
-Prints a row a level, the original goals last: success on the goal that was shown, and how far from
-the original goal the object came to rest (medians, metres, level and vertical). Original goals give
-the starts; noise-free episodes of the policy that the run kept, from a stream of their own.
+Prints a row a level: success on the imagined goal, and how far from the original goal the object
+came to rest (medians, metres, level and vertical). Noise-free episodes of the policy that the run
+kept, from a stream of their own.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ from sb3_follow_object.config import load_config
 from sb3_follow_object.curriculum import Curriculum
 from sb3_follow_object.envs import make_vec
 from sb3_follow_object.experiment import POLICY
-from sb3_follow_object.imagination import imagine
 from sb3_follow_object.policies import load_actor
+from sb3_follow_object.rollout import run_episodes
 from sb3_follow_object.run_folder import PREDICTOR
 from sb3_follow_object.seeds import stream_seed
-
-REACHED = 0.05  # metres
+from sb3_follow_object.wrappers import ImaginedGoalVecEnv
 
 
 def main() -> None:
@@ -37,27 +36,30 @@ def main() -> None:
     config = load_config(arguments.run)
     predictor = GoalPredictor.load(arguments.run / PREDICTOR, config.env_id)
     curriculum = Curriculum(predictor.horizon, **config.settings["curriculum"])
-    env = make_vec(config.env_id, arguments.episodes)
+    env = ImaginedGoalVecEnv(
+        make_vec(config.env_id, arguments.episodes), predictor, curriculum, mode="test"
+    )
     policy = arguments.run / POLICY
     actor, _ = load_actor(policy, env.observation_space, env.action_space)  # type: ignore[arg-type]
     env.seed(stream_seed(config.seed, "levels"))
+    ends: list[np.ndarray] = []
+
+    def note_ends(obs, actions, rewards, dones, infos, next_obs) -> None:  # type: ignore[no-untyped-def]
+        goals = np.array([info["original_goal"] for info in infos])
+        ends.extend((next_obs["achieved_goal"] - goals)[dones])
+
     print("level,success,level_distance,height")
-    for level in [*arguments.levels, None]:
-        obs = env.reset()
-        goal = obs["desired_goal"].copy()
-        shown = goal
-        if level is not None:
-            levels = np.full(len(goal), level)
-            shown = imagine(predictor, curriculum, obs["achieved_goal"], goal, levels)
-        dones = np.zeros(len(goal), dtype=bool)
-        while not dones.any():  # all end together, with the last observation in their infos
-            actions, _ = actor.predict({**obs, "desired_goal": shown}, deterministic=True)
-            obs, _, dones, infos = env.step(actions)
-        end = np.array([info["terminal_observation"]["achieved_goal"] for info in infos])
-        success = np.mean(np.linalg.norm(end - shown, axis=1) < REACHED)
-        across = np.median(np.hypot(*(end - goal)[:, :2].T))
-        above = np.median((end - goal)[:, 2])
-        print(f"{'goal' if level is None else level},{success:.2f},{across:.3f},{above:.3f}")
+    for level in arguments.levels:
+        curriculum.k_max = level
+        ends.clear()
+        episodes = run_episodes(
+            lambda obs: actor.predict(obs, deterministic=True)[0],
+            env,
+            arguments.episodes,
+            note_ends,
+        )
+        across, above = np.median(np.hypot(*np.array(ends)[:, :2].T)), np.median(ends, axis=0)[2]
+        print(f"{level},{episodes.success.mean():.2f},{across:.3f},{above:.3f}")
     env.close()
 
 
