@@ -7,7 +7,7 @@ Stable-Baselines3, are loaded when first used.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .ids import IDS, make_vec, object_id, physics_id, register_envs
+from .ids import IDS, make_vec, object_id, physics_id, register_envs, register_task
 from .tasks import TASKS, Box, Height, Region, Task
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ __all__ = [
     "object_id",
     "physics_id",
     "register_envs",
+    "register_task",
     *_HOME,
 ]
 

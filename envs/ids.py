@@ -15,6 +15,7 @@ IDS: dict[str, tuple[Task, bool]] = {
     for name, task in TASKS.items()
     for suffix in _KINDS
 }
+BUILT_IN = frozenset(IDS)  # what `register_task` adds is not among them
 
 
 def register_envs() -> None:
@@ -28,6 +29,29 @@ def register_envs() -> None:
                 max_episode_steps=task.horizon,
                 kwargs={"task": task.name},
             )
+
+
+def register_task(task: Task) -> str:
+    """Add a task of one's own, which then is known wherever the package's own tasks are.
+
+    Args:
+        task: its name gives the ids `FollowObject/<name>-v0` and `FollowObject/<name>Object-v0`.
+            The same task may be registered again.
+
+    Returns:
+        The id of the robot's environment.
+
+    Raises:
+        ValueError: another task has the name or one of its ids.
+    """
+    ids = {f"FollowObject/{task.name}{suffix}-v0": (task, bool(suffix)) for suffix in _KINDS}
+    for env_id, row in ids.items():
+        if IDS.get(env_id, row) != row:
+            raise ValueError(f"{env_id!r} is another task's already; find a new name.")
+    TASKS[task.name] = task
+    IDS.update(ids)
+    register_envs()
+    return next(iter(ids))
 
 
 def lookup(env_id: str) -> tuple[Task, bool]:
@@ -78,19 +102,20 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
     Raises:
         ValueError: the id is unknown, an option is wrong or `n_envs` is below 1.
     """
-    if env_id in IDS:
+    name = env_id.rpartition(":")[2]  # a module before it has been imported, or gymnasium does it
+    if name in IDS:
         # Late, because the classes need the ids above.
         from .fetch import FetchVecEnv
         from .object_locomotion import ObjectVecEnv
 
-        face = ObjectVecEnv if IDS[env_id][1] else FetchVecEnv
-        return face(env_id, n_envs, n_threads, **options)
+        face = ObjectVecEnv if IDS[name][1] else FetchVecEnv
+        return face(name, n_envs, n_threads, **options)
 
     from stable_baselines3.common.vec_env import DummyVecEnv
 
     if n_envs < 1:
         raise ValueError(f"n_envs must be at least 1, not {n_envs}.")
-    if env_id.rpartition(":")[2] not in gym.registry:
+    if name not in gym.registry:
         import gymnasium_robotics  # its ids are there only once it is imported
 
         gym.register_envs(gymnasium_robotics)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,25 +12,47 @@ import numpy as np
 SUCCESS_DISTANCE = 0.05
 # An object this near to the start region's reference point, seen from above, is drawn again.
 MIN_START_DISTANCE = 0.10
+# Draws of a start or a goal before a task is said to have none.
+_MAX_DRAWS = 10_000
 
 
 @dataclass(frozen=True)
 class Box:
-    """An obstacle: centre relative to the body that carries it, half-size, and its contact."""
+    """An obstacle: centre relative to the body that carries it, half-size, and its contact.
+
+    Raises:
+        ValueError: half-sizes are not positive.
+    """
 
     centre: tuple[float, float, float]
     half_size: tuple[float, float, float]
     friction: tuple[float, float, float] = (1.0, 0.005, 0.0001)
     condim: int = 6
 
+    def __post_init__(self) -> None:
+        if not all(half > 0.0 for half in self.half_size):
+            raise ValueError(f"A box's half-sizes must be positive metres, not {self.half_size}.")
+
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle over the table, given as (x, y) offsets from a reference point."""
+    """A rectangle over the table, given as (x, y) offsets from a reference point.
+
+    Raises:
+        ValueError: an unknown reference, or a lower bound above the upper one.
+    """
 
     reference: Literal["gripper", "table"]
     low: tuple[float, float]
     high: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if self.reference not in ("gripper", "table"):
+            raise ValueError(
+                f"A region's reference is 'gripper' or 'table', not {self.reference!r}."
+            )
+        if not all(low <= high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"A region from {self.low} to {self.high} is empty.")
 
 
 @dataclass(frozen=True)
@@ -70,6 +93,10 @@ class Task:
         tube: boxes of a tube that stands at the goal, relative to the goal's foot on the table.
         blocked_gripper: the fingers stay closed (the pushing tasks).
         min_goal_distance: a goal nearer than this to the object, seen from above, is drawn again.
+
+    Raises:
+        ValueError: the name is not made of letters and digits, the horizon is below 1, or
+            there are lists in place of tuples.
     """
 
     name: str
@@ -82,17 +109,38 @@ class Task:
     blocked_gripper: bool = False
     min_goal_distance: float = 0.0
 
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*", self.name):
+            raise ValueError(f"A task's name is made of letters and digits, not {self.name!r}.")
+        if self.horizon < 1:
+            raise ValueError(f"The horizon of {self.name} is {self.horizon}; it must be >= 1.")
+        try:
+            hash(self)  # scenes are kept by their tasks
+        except TypeError as error:
+            raise ValueError(f"{self.name}: give tuples where there are lists.") from error
+
     def sample(
         self, rng: np.random.Generator, landmarks: Landmarks
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw an episode: the object's start (2,) and the goal (3,), in metres."""
+        """Draw an episode: the object's start (2,) and the goal (3,), in metres.
+
+        Raises:
+            ValueError: the regions are so near to what starts or goals must keep away from that
+                none is found.
+        """
         reference = reference_point(self.start, landmarks)
-        start = _draw(self.start, rng, landmarks)
-        while np.hypot(*(start - reference)) < MIN_START_DISTANCE:
-            start = _draw(self.start, rng, landmarks)
-        goal = _draw(self.goal, rng, landmarks)
-        while np.hypot(*(goal - start)) < self.min_goal_distance:
-            goal = _draw(self.goal, rng, landmarks)
+
+        def draw(region: Region, away_from: np.ndarray, distance: float) -> np.ndarray:
+            for _ in range(_MAX_DRAWS):
+                point = reference_point(region, landmarks) + rng.uniform(region.low, region.high)
+                if not np.hypot(*(point - away_from)) < distance:
+                    return point
+            raise ValueError(
+                f"{self.name}: no point of {region} lies {distance} m from {away_from.round(3)}."
+            )
+
+        start = draw(self.start, reference, MIN_START_DISTANCE)
+        goal = draw(self.goal, start, self.min_goal_distance)
         z = landmarks.rest_height
         if rng.random() < self.height.chance:
             z += rng.uniform(self.height.low, self.height.high)
@@ -103,10 +151,6 @@ def reference_point(region: Region, landmarks: Landmarks) -> np.ndarray:
     """The (x, y) that a region's offsets start from, shape (2,)."""
     point = landmarks.gripper if region.reference == "gripper" else landmarks.table
     return np.array(point[:2])
-
-
-def _draw(region: Region, rng: np.random.Generator, landmarks: Landmarks) -> np.ndarray:
-    return reference_point(region, landmarks) + rng.uniform(region.low, region.high)
 
 
 def _wall(x: float, y: float, half_x: float) -> Box:

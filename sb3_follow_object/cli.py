@@ -280,7 +280,7 @@ def _resumed_config(args: argparse.Namespace) -> RunConfig:
     if args.steps is not None:
         config = dataclasses.replace(config, total_timesteps=args.steps)
     said = {
-        "env": (args.env, config.env_id),
+        "env": (args.env, config.full_id),
         "method": (args.method, config.method),
         "seed": (args.seed, config.seed),
         "n-envs": (args.n_envs, config.settings.get("n_envs")),
@@ -290,7 +290,7 @@ def _resumed_config(args: argparse.Namespace) -> RunConfig:
         if given is not None and given != kept:
             raise ValueError(f"the run in {args.run} has --{name} {kept}, not {given}")
     if args.set or args.config or args.preset:
-        args.env, args.method, args.seed = config.env_id, config.method, config.seed
+        args.env, args.method, args.seed = config.full_id, config.method, config.seed
         args.steps = config.total_timesteps
         return _config(args)  # train() compares it with the folder's
     return config
@@ -304,7 +304,7 @@ def _evaluate(args: argparse.Namespace) -> None:
     config = load_config(args.run)
     env_id = args.env or config.env_id
     seed = config.seed if args.seed is None else args.seed
-    if env_id == config.env_id:
+    if env_id in (config.env_id, config.full_id):
         rate = evaluate(args.run / POLICY, env_id, args.episodes, seed).success_rate
     else:
         rate = cross_test(args.run, env_id, args.episodes, seed)

@@ -6,13 +6,9 @@ import inspect
 import json
 import os
 from collections.abc import Callable, Mapping
-from contextlib import redirect_stderr
-from importlib import import_module
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 from stable_baselines3.td3.policies import TD3Policy
 
 from . import zoo_configs
@@ -20,6 +16,7 @@ from .auxiliary import REWARDS, check_auxiliary, reward_class
 from .cher import GoalSelection
 from .curriculum import Curriculum
 from .envs import IDS, object_id
+from .envs.ids import BUILT_IN
 from .envs.tasks import did_you_mean
 from .experiment import CONFIG, RunConfig
 from .follow_object import FollowObject
@@ -31,10 +28,9 @@ from .object_networks import ObjectNetworks
 from .plain_yaml import load_yaml
 from .policies import HerPolicy
 from .ranges import check_value
+from .task_ids import check_task, import_task
 
 PRESETS = ("default", "paper")
-
-_GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 WRAPPER = "sb3_follow_object.ImaginedGoalWrapper"
 CALLBACK = "sb3_follow_object.CurriculumCallback"
@@ -80,7 +76,8 @@ def run_config(
     """Read a task's settings and return the configuration of a run.
 
     Args:
-        env_id: the task; the file must have an entry for it, or one named "default".
+        env_id: the task; the file must have an entry for it, or one named "default". A task that
+            was added by `register_task` is otherwise set up as the package's most similar one.
         method: one of `METHODS`; None takes what the file trains, without a file "fo".
         preset: "default" or "paper", of the files that come with the package.
         file: YAML in rl_zoo3's layout, in place of a preset.
@@ -90,7 +87,9 @@ def run_config(
     Raises:
         ValueError: an id, a file, a key or a value that cannot be meant, with the nearest that can.
     """
-    check_task(env_id)
+    name = check_task(env_id)
+    module = env_id.rpartition(":")[0] if name in IDS and name not in BUILT_IN else ""
+    env_id = name if name in IDS else env_id
     if file is None:
         method = method or "fo"
         path = preset_file(method, preset)
@@ -106,7 +105,7 @@ def run_config(
             f"{env_id!r} has no environment of its object alone, which imagined goals and SLDR's "
             f"reward come from; train it with --method her, or one of {', '.join(sorted(IDS))}"
         )
-    if has_object_stage and object_id(env_id) in entries:
+    if has_object_stage and _find(entries, object_id(env_id)) is not None:
         settings |= _object_stage(_entry(entries, object_id(env_id), path), path)
     schema = _schema()
     changes: dict[str, Any] = {}
@@ -136,6 +135,7 @@ def run_config(
         seed=seed,
         total_timesteps=total_timesteps,
         settings=_with_tuples(of_class),
+        module=module or None,
         **of_run,
     )
 
@@ -167,8 +167,9 @@ def load_config(folder: str | os.PathLike[str]) -> RunConfig:
     path = Path(folder) / CONFIG
     try:
         saved = json.loads(path.read_text())
-        _registered(saved["env_id"])
-        return RunConfig(**{**saved, "settings": _with_tuples(saved["settings"])})
+        config = RunConfig(**{**saved, "settings": _with_tuples(saved["settings"])})
+        import_task(config.full_id)
+        return config
     except FileNotFoundError as error:
         raise ValueError(f"{folder} holds no run: there is no {path}") from error
     except (OSError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
@@ -190,44 +191,6 @@ def parse_override(text: str) -> tuple[str, Any]:
         raise ValueError(f"the value of {text!r} is not YAML: {error}") from error
 
 
-def check_task(env_id: str) -> None:
-    """Raise a ValueError unless gymnasium knows the id and a robot can pursue goals there."""
-    name = _registered(env_id)
-    if name not in gym.registry:
-        near = did_you_mean(name, [*IDS, *gym.registry])
-        raise ValueError(f"there is no environment {env_id!r}{near}")
-    if name in IDS:
-        return
-    try:
-        env = gym.make(name)
-    except Exception as error:  # an environment of somebody's may raise anything
-        raise ValueError(f"{env_id!r} cannot be made: {error or type(error).__name__}") from error
-    try:
-        missing = set(_GOAL_KEYS) - set(getattr(env.observation_space, "spaces", {}))
-        if missing:
-            raise ValueError(
-                f"{env_id!r} has no goals: its observations lack {', '.join(sorted(missing))}"
-            )
-        if env.spec is None or env.spec.max_episode_steps is None:
-            raise ValueError(f"{env_id!r} does not say how long its episodes are")
-    finally:
-        env.close()
-
-
-def _registered(env_id: str) -> str:
-    """Import the module that may register an id and return the id without the module's name."""
-    module, _, name = env_id.rpartition(":")
-    if module:
-        try:
-            import_module(module)
-        except ImportError as error:
-            raise ValueError(f"{env_id!r} names a module that cannot be imported") from error
-    elif name not in gym.registry:
-        with redirect_stderr(StringIO()):  # it speaks of other environments' versions
-            import_module("gymnasium_robotics")
-    return name
-
-
 def read_yaml(path: Path) -> dict[str, Any]:
     """Return a YAML file's mapping of env ids to settings.
 
@@ -246,12 +209,23 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _entry(entries: dict[str, Any], env_id: str, path: Path) -> dict[str, Any]:
-    entry = entries.get(env_id, entries.get("default"))
+    entry = _find(entries, env_id)
+    if entry is None:
+        entry = entries.get("default")
     if entry is None:
         raise ValueError(f"{path} has no settings for {env_id!r}{did_you_mean(env_id, entries)}")
     if not isinstance(entry, dict):
         raise ValueError(f"{path}: the settings of {env_id!r} are not a mapping")
     return entry
+
+
+def _find(entries: dict[str, Any], env_id: str) -> Any:
+    """Return an id's entry; for a task of one's own, otherwise that of the most similar one."""
+    if env_id not in entries and env_id in IDS and env_id not in BUILT_IN:
+        task, alone = IDS[env_id]
+        env_id = f"FollowObject/{'PushSideGap' if task.blocked_gripper else 'PnPSimpleV2'}-v0"
+        env_id = object_id(env_id) if alone else env_id
+    return entries.get(env_id)
 
 
 def _named(entry: dict[str, Any], key: str, path: Path) -> dict[str, dict[str, Any]]:

@@ -7,10 +7,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-from .config import check_task, load_config
+from .config import load_config
 from .experiment import POLICY, evaluate
 from .files import atomic_write
 from .grid import task_name
+from .task_ids import check_task
 
 CROSS_TESTS = "cross_tests.json"
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from .config import METHODS, check_task, load_config, run_config
+from .config import METHODS, load_config, run_config
 from .envs import IDS, TASKS
 from .envs.tasks import did_you_mean
 from .experiment import (
@@ -26,6 +26,7 @@ from .experiment import (
 )
 from .files import atomic_write
 from .sldr import reads_object_networks
+from .task_ids import check_task
 
 GRID, OBJECT, LOGS = "grid.json", "object", "logs"
 FINISHED, FAILED, UNFINISHED, NOT_RUN = "finished", "failed", "unfinished", "not run"
@@ -128,7 +129,7 @@ def plan(
     for method in methods:
         if method not in METHODS:
             raise ValueError(f"there is no method {method!r}{did_you_mean(method, METHODS)}")
-    ids = {task_name(task): _env_id(task) for task in tasks}
+    ids = {task_name(env_id): env_id for env_id in map(_env_id, tasks)}
     _check_settings(folder, settings)
     cells = []
     for seed in dict.fromkeys(seeds):
@@ -143,7 +144,7 @@ def plan(
 
 def task_name(env_id: str) -> str:
     """Return the short name of one of the package's tasks, or another environment's id."""
-    name = env_id.removeprefix("FollowObject/").removesuffix("-v0")
+    name = env_id.rpartition(":")[2].removeprefix("FollowObject/").removesuffix("-v0")
     return name if name in TASKS else env_id
 
 
@@ -301,7 +302,7 @@ def _config(env_id: str, method: str, seed: int, settings: Settings, threads: in
 
 
 def _paper_rhythm(env_id: str) -> dict[str, int]:
-    horizon = gym.spec(env_id).max_episode_steps
+    horizon = gym.spec(env_id.rpartition(":")[2]).max_episode_steps
     assert horizon is not None  # check_task has seen to it
     return {"eval_every": _EPOCH_EPISODES * horizon, "n_eval_episodes": _PAPER_EPISODES}
 

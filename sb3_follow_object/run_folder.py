@@ -55,6 +55,8 @@ class RunConfig:
         keep_checkpoints: how many of the last checkpoints are kept, >= 1.
         keep_last_checkpoint: whether a finished run keeps one, to be given more steps later.
         torch_threads: of PyTorch; the last bits of a result may depend on it.
+        module: that registers the task when it is imported; None for the package's own tasks and
+            those that gymnasium knows by itself.
     """
 
     env_id: str
@@ -69,6 +71,7 @@ class RunConfig:
     keep_checkpoints: int = 2
     keep_last_checkpoint: bool = False
     torch_threads: int = 1
+    module: str | None = None
 
     def __post_init__(self) -> None:
         for name, low in _WHOLE_NUMBERS.items():
@@ -81,6 +84,11 @@ class RunConfig:
             )
         if not self.checkpoint_minutes > 0.0:
             raise ValueError(f"checkpoint_minutes is {self.checkpoint_minutes}; it must be > 0")
+
+    @property
+    def full_id(self) -> str:
+        """The task's id as the command line takes it, with the module before it."""
+        return self.env_id if self.module is None else f"{self.module}:{self.env_id}"
 
 
 # ---- whose folder it is -----------------------------------------------------------------------

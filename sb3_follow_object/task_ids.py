@@ -1,0 +1,67 @@
+"""Which environment an id means, and whether a robot can pursue goals there."""
+
+from __future__ import annotations
+
+from contextlib import redirect_stderr
+from importlib import import_module
+from io import StringIO
+
+import gymnasium as gym
+
+from .envs import IDS
+from .envs.tasks import did_you_mean
+
+_GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+def check_task(env_id: str) -> str:
+    """Return an id without a module's name, if a robot can pursue goals there.
+
+    Raises:
+        ValueError: gymnasium does not know the id, or the environment has no goals or no horizon.
+    """
+    name = import_task(env_id)
+    if name not in gym.registry:
+        near = did_you_mean(name, [*IDS, *gym.registry])
+        raise ValueError(f"there is no environment {env_id!r}{near}")
+    if name in IDS:
+        return name
+    try:
+        env = gym.make(name)
+    except Exception as error:  # an environment of somebody's may raise anything
+        raise ValueError(f"{env_id!r} cannot be made: {error or type(error).__name__}") from error
+    try:
+        missing = set(_GOAL_KEYS) - set(getattr(env.observation_space, "spaces", {}))
+        if missing:
+            raise ValueError(
+                f"{env_id!r} has no goals: its observations lack {', '.join(sorted(missing))}"
+            )
+        if env.spec is None or env.spec.max_episode_steps is None:
+            raise ValueError(f"{env_id!r} does not say how long its episodes are")
+    finally:
+        env.close()
+    return name
+
+
+def import_task(env_id: str) -> str:
+    """Import the module that may register an id and return the id without the module's name.
+
+    Args:
+        env_id: gymnasium id, with "module:" before it where importing that module registers it.
+
+    Raises:
+        ValueError: the module cannot be imported.
+    """
+    module, _, name = env_id.rpartition(":")
+    if module:
+        try:
+            import_module(module)
+        except ImportError as error:
+            raise ValueError(
+                f"{env_id!r} names a module that cannot be imported ({error}); "
+                "is it installed, or its folder on PYTHONPATH?"
+            ) from error
+    elif name not in gym.registry:
+        with redirect_stderr(StringIO()):  # it speaks of other environments' versions
+            import_module("gymnasium_robotics")
+    return name
