@@ -367,7 +367,9 @@ def _compare(args: argparse.Namespace) -> None:
     else:
         from .ray_executor import RayExecutor, connect
 
-        jobs, threads = share_cores(connect(args.ray), n_runs, args.jobs, args.threads or 1)
+        jobs, threads = share_cores(
+            connect(args.ray, args.threads or 1), n_runs, args.jobs, args.threads or 1
+        )
         executor = RayExecutor(jobs)
     args.out.mkdir(parents=True, exist_ok=True)
     with lock(args.out, wait=False), GridDisplay(quiet=args.quiet) as display:

@@ -94,16 +94,26 @@ class Comparison:
             total = 0 if over else cell.config.total_timesteps
             self._display.expect(cell.name, total, trained_steps(cell.folder) or 0)
         with _stop_on_signals(self._request_stop):
-            self._fill()
-            while self._jobs:
-                for name, message in self._executor.messages(_POLL):
-                    self._take(name, message)
-                self._stop_when_asked()
+            try:
                 self._fill()
-                self._display.refresh()
+                while self._jobs:
+                    self._listen()
+                    self._stop_when_asked()
+                    self._fill()
+                    self._display.refresh()
+            except Exception:  # a full disk, say: what runs writes its checkpoint and ends
+                self._requests = max(self._requests, 1)
+                while self._jobs:
+                    self._stop_when_asked()
+                    self._listen()
+                raise
         if self._requests:
             raise KeyboardInterrupt
         return [name for name in self._cells if self._ledger.failed(name)]
+
+    def _listen(self) -> None:
+        for name, message in self._executor.messages(_POLL):
+            self._take(name, message)
 
     def _request_stop(self) -> None:
         self._requests += 1  # heeded between two jobs: a signal may come while one is started
@@ -124,9 +134,9 @@ class Comparison:
             job = self._next_job()
             if job is None:
                 break
+            self._executor.start(job)
             self._jobs[job.name] = job
             self._display.started(job.name, job.kind)
-            self._executor.start(job)
         left = [c for c in self._cells.values() if not c.finished and not self._failed(c)]
         finished = sum(cell.finished for cell in self._cells.values())
         failed = len(self._cells) - finished - len(left)

@@ -23,6 +23,7 @@ from .follow_object import FollowObject
 from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
 from .her_replay_buffer import FollowObjectReplayBuffer
+from .keywords import with_tuples
 from .methods import METHODS as METHODS
 from .object_networks import ObjectNetworks
 from .plain_yaml import load_yaml
@@ -44,6 +45,7 @@ _CALLBACK_NAMES = {"every": "test_every", "n_episodes": "n_test_episodes", "stor
 
 # What the run itself decides, or what YAML cannot hold.
 _NOT_SETTINGS = {"self", "env", "env_id", "seed", "settings", "method", "imagine", "algorithm"}
+_NOT_SETTINGS |= {"module"}
 _NOT_SETTINGS |= {
     "model",
     "object_networks",
@@ -134,7 +136,7 @@ def run_config(
         found,
         seed=seed,
         total_timesteps=total_timesteps,
-        settings=_with_tuples(of_class),
+        settings=with_tuples(of_class),
         module=module or None,
         **of_run,
     )
@@ -167,7 +169,7 @@ def load_config(folder: str | os.PathLike[str]) -> RunConfig:
     path = Path(folder) / CONFIG
     try:
         saved = json.loads(path.read_text())
-        config = RunConfig(**{**saved, "settings": _with_tuples(saved["settings"])})
+        config = RunConfig(**{**saved, "settings": with_tuples(saved["settings"])})
         import_task(config.full_id)
         return config
     except FileNotFoundError as error:
@@ -225,7 +227,7 @@ def _find(entries: dict[str, Any], env_id: str) -> Any:
         task, alone = IDS[env_id]
         env_id = f"FollowObject/{'PushSideGap' if task.blocked_gripper else 'PnPSimpleV2'}-v0"
         env_id = object_id(env_id) if alone else env_id
-    return entries.get(env_id)
+    return entries.get(env_id, entries.get(env_id.rpartition(":")[2]))
 
 
 def _named(entry: dict[str, Any], key: str, path: Path) -> dict[str, dict[str, Any]]:
@@ -375,15 +377,3 @@ def _plain(value: Any) -> Any:
     except ValueError:
         return value
     return int(number) if number.is_integer() else number
-
-
-def _with_tuples(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return settings with SB3's train_freq, a list in YAML and JSON, as the tuple it wants."""
-    return {
-        name: _with_tuples(value)
-        if isinstance(value, dict)
-        else tuple(value)
-        if name == "train_freq" and isinstance(value, list)
-        else value
-        for name, value in settings.items()
-    }

@@ -28,6 +28,8 @@ def cross_test(
 ) -> float:
     """Test a run's policy on another task, keep the figure in the run's folder and return it.
 
+    Kept is the test with the most episodes, of equal ones the last.
+
     Args:
         run: folder with config.json and policy.safetensors.
         env_id: the other task; its observations, actions and goals must be shaped as the run's.
@@ -43,9 +45,10 @@ def cross_test(
     n_episodes = config.n_final_episodes if n_episodes is None else n_episodes
     seed = config.seed if seed is None else seed
     rate = evaluate(run / POLICY, env_id, n_episodes, seed).success_rate
-    figures = {"success_rate": rate, "episodes": n_episodes}
-    kept = {**read_cross_tests(run), task_name(env_id): figures}
-    atomic_write(run / CROSS_TESTS, json.dumps(kept, indent=1).encode())
+    kept, name = read_cross_tests(run), task_name(env_id)
+    if name not in kept or kept[name]["episodes"] <= n_episodes:
+        kept[name] = {"success_rate": rate, "episodes": n_episodes}
+        atomic_write(run / CROSS_TESTS, json.dumps(kept, indent=1).encode())
     return rate
 
 

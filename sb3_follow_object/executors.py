@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -68,11 +69,9 @@ class LocalExecutor:
                 start_new_session=True,  # Ctrl-C reaches this process alone, which passes it on
             )
         assert child.stdin is not None
-        try:
-            child.stdin.write(job.to_json())
-            child.stdin.close()
-        except OSError:
-            pass  # it died at once; its log says why
+        with suppress(OSError):  # it died at once; its log says why
+            child.stdin.write(job.to_json() + "\n")
+            child.stdin.flush()  # and stays open: the child ends when this process does
         self._children[job.name] = child
         threading.Thread(target=self._listen, args=(job.name, child), daemon=True).start()
 
@@ -102,6 +101,9 @@ class LocalExecutor:
             if "failed" not in message:
                 self._inbox.put((name, message))
         status = child.wait()
+        assert child.stdin is not None
+        with suppress(OSError):
+            child.stdin.close()
         self._children.pop(name, None)
         if status == 0:
             last: Message = {"finished": True}

@@ -67,6 +67,7 @@ def train(
     progress: Progress = lambda figures: None,
     command: str = "",
     object_stage_only: bool = False,
+    wait: bool = False,
 ) -> dict[str, Any]:
     """Train in a folder and return its result, also written to result.json.
 
@@ -82,10 +83,12 @@ def train(
         progress: called with env_steps, k_max and success_rate after each rollout.
         command: the command line to note in the result.
         object_stage_only: end where the robot's training would begin, and return nothing.
+        wait: resume once another process that trains in the folder has ended.
 
     Raises:
         ValueError: the folder holds another run, none where one should be resumed, one that another
-            process trains, or a finished one that kept no checkpoint for the steps asked for.
+            process trains (without `wait`), or a finished one that kept no checkpoint for the steps
+            asked for.
         RuntimeError: the training cannot go on; the last checkpoint is as it was.
         KeyboardInterrupt: after the checkpoint of an interrupted run.
     """
@@ -93,7 +96,7 @@ def train(
     with ExitStack() as stack:
         if resume:
             check_same_run(folder, config)
-            stack.enter_context(lock(folder, wait=False))
+            stack.enter_context(lock(folder, wait=wait))
             result = finished_result(folder, config)
             if result is not None:
                 report(f"{folder} is finished already")
@@ -239,6 +242,8 @@ def _object_stage(
     state = None if saved is None else saved["object"]
     learn(writer, state, between_epochs=stop.check, networks=shared)
     save_object_stage(folder, run, wall_s())
+    if shared:
+        checkpoints.remove()
     return wall_s()
 
 
@@ -268,7 +273,8 @@ def evaluate(
         between_steps: called after each step; may raise to stop.
 
     Raises:
-        ValueError: the file is missing, damaged or for another task, or `n_episodes` below 1.
+        ValueError: the file is missing, damaged or for other observations or actions, or
+            `n_episodes` below 1.
     """
     env = evaluation_env(env_id, stream_seed(seed, "final test"))
     try:
@@ -300,17 +306,20 @@ def _check_algorithms(run: FollowObject) -> None:
     """Build both algorithms once, in small, so that a wrong argument is not found hours later."""
     small = {"policy": "MultiInputPolicy", "buffer_size": 10 * run.env.num_envs}
     settings = run.settings
-    envs = [(run.env, settings["algorithm"])]
+    envs = [(run.env, settings["algorithm"], run.imagine)]
     if run.has_object_stage:
         object_env = make_vec(object_id(run.env_id), 1)
-        envs.append((object_env, settings["object_algorithm"]))
-    for env, arguments in envs:
+        envs.append((object_env, settings["object_algorithm"], False))
+    for env, arguments, imagines in envs:
         arguments = copy.deepcopy(arguments)
-        if (
-            run.object_stage.needs_networks
-        ):  # what it needs is not there yet; its settings have been checked
+        replay = dict(arguments.get("replay_buffer_kwargs") or {})
+        if replay.get("copy_info_dict"):
+            raise ValueError("copy_info_dict cannot be set: checkpoints do not hold infos")
+        # What these two need is not there yet; their settings have been checked.
+        if run.object_stage.needs_networks:
             arguments.pop("auxiliary", None)
-        replay = {**(arguments.get("replay_buffer_kwargs") or {}), "imagined_ratio": 0.0}
+        if imagines:
+            replay["imagined_ratio"] = 0.0
         try:
             HerDDPG(env=env, **{**arguments, **small, "replay_buffer_kwargs": replay})
         except ValueError:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -20,7 +21,7 @@ from .envs import IDS, make_vec
 from .files import atomic_write
 from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
-from .keywords import check_keywords
+from .keywords import check_keywords, with_tuples
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
 from .object_stage import ObjectStage, Report
@@ -270,6 +271,8 @@ class FollowObject:
             callbacks += callback
         elif isinstance(callback, BaseCallback):
             callbacks.append(callback)
+        elif callback is not None:
+            callbacks.append(ConvertCallback(callback))
         model.learn(
             remaining,
             callback=CallbackList(callbacks),
@@ -324,6 +327,8 @@ class FollowObject:
         if "replay_buffer" in state:
             assert model.replay_buffer is not None
             model.replay_buffer.load_state_dict(state["replay_buffer"])
+        else:
+            model.expect_new_replay()
         if state["env"] is None:
             begin_new_episodes(model)
         set_global_generators(state["generators"])
@@ -334,16 +339,26 @@ class FollowObject:
         Args:
             folder: is created; files of an earlier save are replaced.
             replay_buffer: False makes a small save that can act and train on, from empty replay.
+
+        Raises:
+            ValueError: a setting is a Python object, which a save does not hold.
         """
+        try:
+            settings = json.dumps(self.settings, indent=2).encode()
+        except TypeError as error:
+            raise ValueError(f"these settings cannot be saved: {error}") from error
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        if self.predictor is not None and not (folder / "predictor").exists():
+        if self.predictor is not None:
             self.predictor.save(folder / "predictor")
-        networks = self.object_stage.networks
-        if networks is not None and not (folder / OBJECT_FILE).exists():
-            networks.save(folder / OBJECT_FILE)
+        elif (folder / "predictor").exists():
+            shutil.rmtree(folder / "predictor")
+        if self.object_stage.networks is not None:
+            self.object_stage.networks.save(folder / OBJECT_FILE)
+        else:
+            (folder / OBJECT_FILE).unlink(missing_ok=True)
         save_tree(folder / "state.safetensors", self.state_dict(replay_buffer))
-        atomic_write(folder / "settings.json", json.dumps(self.settings, indent=2).encode())
+        atomic_write(folder / "settings.json", settings)
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str], report: Report | None = None) -> FollowObject:
@@ -354,7 +369,7 @@ class FollowObject:
         """
         folder = Path(folder)
         try:
-            settings = json.loads((folder / "settings.json").read_text())
+            settings = with_tuples(json.loads((folder / "settings.json").read_text()))
             predictor = None
             if (folder / "predictor").exists():
                 predictor = GoalPredictor.load(folder / "predictor", env_id=settings["env_id"])

@@ -48,8 +48,8 @@ class Settings:
         steps: env steps of each run, >= 1; None leaves them to the preset.
         preset: of the package's settings, "default" or "paper".
         overrides: settings by their dotted names, as `run_config` takes them.
-        paper_evaluation: validate on 380 episodes after every 1,900 training episodes, as the
-            paper does (section 5.3), in place of the settings' own rhythm.
+        paper_evaluation: validate on 380 episodes every 1,900 episodes' env steps, the epoch of
+            the paper (section 5.3), in place of the settings' own rhythm.
     """
 
     steps: int | None = None
@@ -137,8 +137,12 @@ def plan(
             for method in dict.fromkeys(methods):
                 config = _config(env_id, method, seed, settings, threads)
                 path = folder / f"{_file_name(task)}-{method}-{seed}"
-                cell = Cell(path, task, config, _command(path, env_id, method, seed, settings))
-                cells.append(replace(cell, config=_kept_config(cell) or config))
+                command = _command(path, config, settings)
+                cell = Cell(path, task, config, command)
+                kept = _kept_config(cell)
+                if kept is not None:
+                    cell = replace(cell, config=kept, command=_command(path, kept, settings))
+                cells.append(cell)
     return cells
 
 
@@ -275,6 +279,7 @@ def read_grid(folder: Path) -> dict[str, Any] | None:
             raise ValueError(f"its format is {content['format']!r}, not {_FORMAT}")
         for cell in content["cells"].values():
             str(cell["task"]), str(cell["method"]), int(cell["seed"]), int(cell["failures"])
+            str(cell["error"])
     except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not the file of a comparison's grid ({error})") from error
     return dict(content)
@@ -307,14 +312,15 @@ def _paper_rhythm(env_id: str) -> dict[str, int]:
     return {"eval_every": _EPOCH_EPISODES * horizon, "n_eval_episodes": _PAPER_EPISODES}
 
 
-def _command(path: Path, env_id: str, method: str, seed: int, settings: Settings) -> str:
-    words = ["sb3-follow-object", "train", "--run", str(path), "--env", env_id]
-    words += ["--method", method, "--seed", str(seed)]
+def _command(path: Path, config: RunConfig, settings: Settings) -> str:
+    words = ["sb3-follow-object", "train", "--run", str(path), "--env", config.full_id]
+    words += ["--method", config.method, "--seed", str(config.seed)]
+    words += ["--threads", str(config.torch_threads)]
     if settings.steps is not None:
         words += ["--steps", str(settings.steps)]
     if settings.preset != "default":
         words += ["--preset", settings.preset]
-    changes = dict(_paper_rhythm(env_id)) if settings.paper_evaluation else {}
+    changes = dict(_paper_rhythm(config.env_id)) if settings.paper_evaluation else {}
     changes |= settings.overrides or {}
     if changes:
         words += ["--set", *(f"{name}={json.dumps(value)}" for name, value in changes.items())]

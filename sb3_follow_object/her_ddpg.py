@@ -340,6 +340,10 @@ class HerDDPG(DDPG):
         for name in self._COUNTERS:
             setattr(self, name, state["counters"][name])
 
+    def expect_new_replay(self) -> None:
+        """Take in for the moments what is stored from now on: the replay buffer begins anew."""
+        self._moments_pos = 0
+
     def _target_bounds(self) -> tuple[float, float]:
         if self.target_clip == "auto":
             return -1.0 / (1.0 - self.gamma), 0.0

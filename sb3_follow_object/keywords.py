@@ -24,3 +24,15 @@ def check_keywords(
     for key in given:
         if key not in known:
             raise ValueError(f"{name} has no setting {key!r}{did_you_mean(key, sorted(known))}")
+
+
+def with_tuples(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings with SB3's train_freq, a list in YAML and JSON, as the tuple it wants."""
+    return {
+        name: with_tuples(value)
+        if isinstance(value, dict)
+        else tuple(value)
+        if name == "train_freq" and isinstance(value, list)
+        else value
+        for name, value in settings.items()
+    }

@@ -15,7 +15,8 @@ from torch import nn
 from .checkpoint import load_tree, save_tree
 from .her_ddpg import HerDDPG
 from .policies import HerPolicy, NormalizedGoalExtractor
-from .predictor_files import LAYERS_LIMIT, WIDTH_LIMIT
+from .predictor_files import valid_hidden
+from .tensors import lowest
 
 FILE = "object_networks.safetensors"
 FORMAT = 1
@@ -112,11 +113,17 @@ class ObjectNetworks(nn.Module):
             between_updates: called after each; may raise to stop.
 
         Raises:
-            ValueError: an argument is outside its range.
+            ValueError: an argument is outside its range, or the policy has other activations than
+                ReLU.
         """
         cls.check_fit(hidden, learning_rate, batch_size, updates)
         policy = model.policy
         assert policy.net_arch is not None
+        if policy.activation_fn is not nn.ReLU:
+            raise ValueError(
+                "SLDR's reward reads an object policy with ReLU, not "
+                f"{policy.activation_fn.__name__}; leave activation_fn out of object_algorithm"
+            )
         pi, qf = get_actor_critic_arch(policy.net_arch)
         extractor = model.actor.features_extractor
         assert isinstance(extractor, NormalizedGoalExtractor)
@@ -196,7 +203,7 @@ class ObjectNetworks(nn.Module):
     def value(self, states: th.Tensor, goals: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return Q_obj of actions (n, 1)."""
         inputs = th.cat([self.features(states, goals), actions], dim=1)
-        return th.stack([critic(inputs) for critic in self.critics]).amin(dim=0)
+        return lowest([critic(inputs) for critic in self.critics])
 
     def infer(self, states: th.Tensor, next_states: th.Tensor, goals: th.Tensor) -> th.Tensor:
         """Return the actions (n, 7) that would have led from states to next states (n, 12)."""
@@ -269,13 +276,8 @@ def _dict_space() -> spaces.Dict:
 def _check_shape(shape: Any) -> None:
     """Raise unless a network of this shape can be built without allocating at a file's will."""
     for name in ("pi", "qf", "inverse"):
-        widths = shape[name]
-        if not (
-            isinstance(widths, list)
-            and 1 <= len(widths) <= LAYERS_LIMIT
-            and all(type(width) is int and 1 <= width <= WIDTH_LIMIT for width in widths)
-        ):
-            raise ValueError(f"{name} has hidden layers {widths!r}")
+        if not valid_hidden(shape[name]):
+            raise ValueError(f"{name} has hidden layers {shape[name]!r}")
     if type(shape["n_critics"]) is not int or not 1 <= shape["n_critics"] <= _CRITICS_LIMIT:
         raise ValueError(f"n_critics is {shape['n_critics']!r}")
     if type(shape["layer_norm"]) is not bool or not float(shape["clip"]) > 0.0:

@@ -50,7 +50,7 @@ def draw_imagined(
         env_id: a task of this package.
         predictor: its F_phi.
         out: PNG file to create or replace.
-        seed: of the first episode.
+        seed: of the first episode, at least 0.
 
     Raises:
         MissingExtra: imageio is not installed.
@@ -88,10 +88,12 @@ def record(
     Raises:
         MissingExtra: imageio or its ffmpeg is not installed.
         RuntimeError: there is nothing to draw with.
-        ValueError: no episodes are asked for, or the policy does not fit the task.
+        ValueError: no episodes are asked for, a negative seed, or the policy does not fit the task.
     """
     if n_episodes < 1:
         raise ValueError(f"episodes is {n_episodes}; it must be at least 1")
+    if seed < 0:
+        raise ValueError(f"seed is {seed}; it must be at least 0")
     imageio = need("imageio", "video")
     need("imageio_ffmpeg", "video")
     out = Path(out)

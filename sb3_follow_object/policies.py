@@ -18,6 +18,11 @@ from torch import nn
 
 from .checkpoint import load_tree, save_tree
 
+# Activation functions that a policy's file may name.
+_ACTIVATIONS: dict[str, type[nn.Module]] = {
+    each.__name__: each for each in (nn.ReLU, nn.Tanh, nn.ELU, nn.GELU, nn.SiLU)
+}
+
 
 class NormalizedGoalExtractor(BaseFeaturesExtractor):
     """Observation and desired goal, standardised and clipped, as one vector.
@@ -149,8 +154,25 @@ def save_actor(path: str | os.PathLike[str], actor: Actor, env_id: str) -> None:
         path: file to create or replace, e.g. policy.safetensors.
         actor: of a `HerPolicy`.
         env_id: the task that it was trained for.
+
+    Raises:
+        ValueError: the actor's activation function is none that a file can name.
     """
-    save_tree(path, {"env_id": env_id, "net_arch": actor.net_arch, "actor": actor.state_dict()})
+    extractor = actor.features_extractor
+    assert isinstance(extractor, NormalizedGoalExtractor)
+    activation = actor.activation_fn.__name__
+    if _ACTIVATIONS.get(activation) is not actor.activation_fn:
+        raise ValueError(
+            f"a policy's file can name the activations {', '.join(_ACTIVATIONS)}, not {activation}"
+        )
+    saved = {
+        "env_id": env_id,
+        "net_arch": actor.net_arch,
+        "activation": activation,
+        "clip": extractor.clip,
+        "actor": actor.state_dict(),
+    }
+    save_tree(path, saved)
 
 
 def load_actor(
@@ -166,11 +188,20 @@ def load_actor(
     """
     saved = load_tree(path)
     try:
-        extractor = NormalizedGoalExtractor(observation_space)
+        # The first files had neither.
+        clip, activation = float(saved.get("clip", 5.0)), saved.get("activation", "ReLU")
+        if not clip > 0.0:
+            raise ValueError(f"its inputs are clipped at {clip}")
+        extractor = NormalizedGoalExtractor(observation_space, clip)
         widths = [extractor.features_dim, *saved["net_arch"], *action_space.shape]
         _check_layers(saved["actor"], widths)  # before anything of their size is allocated
         actor = Actor(
-            observation_space, action_space, saved["net_arch"], extractor, extractor.features_dim
+            observation_space,
+            action_space,
+            saved["net_arch"],
+            extractor,
+            extractor.features_dim,
+            _ACTIVATIONS[activation],
         )
         actor.load_state_dict(saved["actor"])
         actor.set_training_mode(False)

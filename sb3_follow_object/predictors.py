@@ -18,6 +18,7 @@ from .object_stage import Report
 from .predictor_files import FACTS_FILE
 from .run_folder import RunConfig
 
+_FILES = (FACTS_FILE, OBJECT_FILE)
 CACHE_VARIABLE = "SB3_FOLLOW_OBJECT_CACHE"
 
 
@@ -34,7 +35,8 @@ def get_predictor(
 
     Raises:
         ValueError: the folder holds a predictor for another task, other physics or another
-            object_on_table, or a damaged one; or the id is not of this package.
+            object_on_table, a damaged one, or an object's networks alone; or the id is not of this
+            package.
     """
     path = _kept(FACTS_FILE, env_id, folder, report)
     on_table = keeps_object_on_table(env_id)
@@ -45,7 +47,11 @@ def get_predictor(
 def get_object_networks(
     env_id: str, folder: str | os.PathLike[str] | None = None, report: Report = print
 ) -> ObjectNetworks:
-    """Return what SLDR needs of a task's object stage; kept beside F_phi, see `get_predictor`."""
+    """Return what SLDR needs of a task's object stage; kept beside F_phi, see `get_predictor`.
+
+    Raises:
+        ValueError: as `get_predictor`; or the folder holds F_phi alone, which is not replaced.
+    """
     path = _kept(OBJECT_FILE, env_id, folder, report)
     return ObjectNetworks.load(path, env_id=env_id, physics=physics_id(env_id))
 
@@ -56,6 +62,9 @@ def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report:
     path.mkdir(parents=True, exist_ok=True)
     with lock(path, wait=True):  # those of a SubprocVecEnv come together
         if not (path / name).exists():
+            other = next((file for file in _FILES if (path / file).exists()), None)
+            if folder is not None and other is not None:
+                raise ValueError(f"{path} has {other} but no {name}; give an empty folder")
             learn_predictor(run_config(env_id), path, report)
     return path / name
 

@@ -7,6 +7,8 @@ import os
 import signal
 import tempfile
 import time
+from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from typing import Any
 from .executors import Message
 from .experiment import OBJECT_STAGE, RESULT
 from .extras import need
-from .files import atomic_write
+from .files import atomic_write, lock
 from .worker import Job, one_line, run_job
 
 LOCAL = "local"
@@ -22,15 +24,16 @@ LOCAL = "local"
 _POST_EVERY = 1.0  # seconds between two reports of figures: a rollout may take less
 
 
-def connect(address: str) -> int:
+def connect(address: str, threads: int = 1) -> int:
     """Connect to a Ray cluster and return how many cores it has.
 
     Args:
         address: of the cluster, e.g. 10.0.0.1:6379 or auto; LOCAL starts one on this machine.
+        threads: cores that each job will ask for, on one node.
 
     Raises:
         MissingExtra: Ray is not installed.
-        ValueError: nothing answers there, or it has no cores.
+        ValueError: nothing answers there, or no node has so many cores.
     """
     ray = need("ray", "ray")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody asked for reports
@@ -40,8 +43,13 @@ def connect(address: str) -> int:
         except (OSError, RuntimeError, ValueError) as error:
             raise ValueError(f"no Ray cluster answers at {address!r}: {error}") from error
     cores = int(ray.cluster_resources().get("CPU", 0))
-    if cores < 1:
-        raise ValueError(f"the Ray cluster at {address!r} has no cores")
+    nodes = [node.get("Resources", {}).get("CPU", 0) for node in ray.nodes() if node["Alive"]]
+    largest = int(max(nodes, default=0))
+    if largest < threads:
+        raise ValueError(
+            f"no node of the Ray cluster at {address!r} has {threads} cores for a run, "
+            f"the largest has {largest}; give fewer --threads"
+        )
     return cores
 
 
@@ -63,10 +71,17 @@ class RayExecutor:
         actor = self._ray.remote(num_cpus=0)(_Mailbox)
         self._mailbox = actor.options(scheduling_strategy=here).remote()
         self._jobs: dict[Any, Job] = {}  # by Ray's reference to their outcome
+        self._locks: dict[str, ExitStack] = {}  # of the folders whose runs are away
         self._stopping = False
 
     def start(self, job: Job) -> None:
-        """Begin a job."""
+        """Begin a job.
+
+        Raises:
+            ValueError: another process works in its folder.
+        """
+        held = self._locks[job.name] = ExitStack()
+        held.enter_context(lock(Path(job.folder), wait=False))
         # A failure is judged here, where it is written down; Ray must not repeat it by itself.
         task = self._ray.remote(num_cpus=job.threads, max_retries=0)(_work)
         reference = task.remote(job.to_json(), _read_files(Path(job.folder)), self._mailbox)
@@ -78,12 +93,13 @@ class RayExecutor:
         told: list[tuple[str, Message]] = self._ray.get(self._mailbox.drain.remote())
         for reference in ended:
             job = self._jobs.pop(reference)
-            try:
-                outcome, files = self._ray.get(reference)
-            except self._ray.exceptions.RayError as error:  # its process or its node is gone
-                told.append((job.name, {"failed": one_line(error)}))
-                continue
-            _write_files(Path(job.folder), files)
+            with self._locks.pop(job.name):
+                try:
+                    outcome, files, gone = self._ray.get(reference)
+                    _write_files(Path(job.folder), files, gone)
+                # Its process or its node is gone, or there is no room for its files here.
+                except (self._ray.exceptions.RayError, OSError) as error:
+                    outcome = {"failed": one_line(error)}
             told.append((job.name, outcome))
         return told
 
@@ -118,8 +134,15 @@ class _Mailbox:
         self._stopping = True
 
 
-def _work(job_json: str, files: dict[str, bytes], mailbox: Any) -> tuple[Message, dict[str, bytes]]:
-    """Do a job on a node, in a folder of its own; return how it ended and the folder's files."""
+def _work(
+    job_json: str, files: dict[str, bytes], mailbox: Any
+) -> tuple[Message, dict[str, bytes], set[str]]:
+    """Do a job on a node, in a folder of its own.
+
+    Returns:
+        How it ended, the folder's files, and the names of those that came with the job and are
+        there no more.
+    """
     ray = need("ray", "ray")
     job = Job(**json.loads(job_json))
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -146,7 +169,8 @@ def _work(job_json: str, files: dict[str, bytes], mailbox: Any) -> tuple[Message
             outcome = {"stopped": True}
         except Exception as error:
             outcome = {"failed": one_line(error)}
-        return outcome, _read_files(folder)
+        left = _read_files(folder)
+        return outcome, left, set(files) - set(left)
 
 
 def _read_files(folder: Path) -> dict[str, bytes]:
@@ -158,14 +182,12 @@ def _read_files(folder: Path) -> dict[str, bytes]:
     }
 
 
-def _write_files(folder: Path, files: dict[str, bytes]) -> None:
-    """Make a run's folder hold these files and no others but hidden ones."""
+def _write_files(folder: Path, files: dict[str, bytes], gone: Iterable[str] = ()) -> None:
+    """Write files into a run's folder and remove those that are gone."""
     # These two say that everything else is there.
     for name in sorted(files, key=lambda name: name in (OBJECT_STAGE, RESULT)):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(path, files[name])
-    for path in folder.rglob("*"):
-        gone = path.relative_to(folder).as_posix() not in files
-        if gone and path.is_file() and not path.name.startswith("."):
-            path.unlink()
+    for name in gone:
+        (folder / name).unlink(missing_ok=True)

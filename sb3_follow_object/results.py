@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from .experiment import CONFIG, RESULT, trained_steps
 from .extras import MissingExtra, need
 from .files import atomic_write
 from .grid import ATTEMPTS, FAILED, FINISHED, NOT_RUN, UNFINISHED, read_grid, task_name
+from .run_folder import read_result
 
 TABLE_CSV, TABLE_MD = "table.csv", "table.md"
 
@@ -310,17 +310,9 @@ def _read_run(path: Path, cell: dict[str, Any] | None) -> Run:
     config = load_config(path)
     place = (path, task_name(config.env_id), config.method, config.seed)
     if (path / RESULT).exists():
-        try:
-            result = json.loads((path / RESULT).read_text())
-            return Run(
-                *place,
-                status=FINISHED,
-                env_steps=int(result["env_steps"]),
-                wall_s=float(result["wall_s"]),
-                success_rate=float(result["success_rate"]),
-            )
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path / RESULT} is not the result of a run ({error})") from error
+        result = read_result(path)
+        figures = {name: result[name] for name in ("env_steps", "wall_s", "success_rate")}
+        return Run(*place, status=FINISHED, **figures)
     steps = trained_steps(path)
     if cell is not None and cell["failures"] >= ATTEMPTS:
         return Run(*place, status=FAILED, env_steps=steps, error=cell["error"])

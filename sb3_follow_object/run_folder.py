@@ -37,6 +37,10 @@ _WHOLE_NUMBERS = {"seed": 0, "total_timesteps": 1, "eval_every": 1, "n_eval_epis
 _WHOLE_NUMBERS |= {"n_final_episodes": 1, "keep_checkpoints": 1, "torch_threads": 1}
 
 
+# What everything that reads a result needs of it.
+_RESULT: dict[str, type] = {"env_steps": int, "wall_s": float, "success_rate": float}
+
+
 @dataclass(frozen=True)
 class RunConfig:
     """What decides a run.
@@ -177,7 +181,7 @@ def finished_result(folder: Path, config: RunConfig) -> dict[str, Any] | None:
     """
     if not (folder / RESULT).exists():
         return None
-    result = dict(json.loads((folder / RESULT).read_text()))
+    result = read_result(folder)
     if result["env_steps"] >= config.total_timesteps:
         return result
     if not checkpoint_files(folder):
@@ -186,6 +190,22 @@ def finished_result(folder: Path, config: RunConfig) -> dict[str, Any] | None:
             "checkpoint to go on from; one started with --set keep_last_checkpoint=true keeps it"
         )
     return None
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """Return the content of a run's result.json.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    path = folder / RESULT
+    try:
+        result = json.loads(path.read_text())
+        for name, kind in _RESULT.items():
+            result[name] = kind(result[name])
+        return dict(result)
+    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not the result of a run ({error})") from error
 
 
 def source_commit() -> str | None:
@@ -204,10 +224,13 @@ def trained_steps(folder: str | os.PathLike[str]) -> int | None:
     """Return the env steps that a run folder's training took; None where it does not say."""
     folder = Path(folder)
     if (folder / RESULT).exists():
-        return int(json.loads((folder / RESULT).read_text())["env_steps"])
+        return int(read_result(folder)["env_steps"])
     if (folder / EVALUATIONS).exists():
         rows = (folder / EVALUATIONS).read_text().splitlines()[1:]
-        return int(rows[-1].split(",")[0]) if rows else None
+        try:
+            return int(rows[-1].split(",")[0]) if rows else None
+        except ValueError as error:
+            raise ValueError(f"{folder / EVALUATIONS} is damaged: {error}") from error
     return None
 
 

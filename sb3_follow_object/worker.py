@@ -1,7 +1,8 @@
 """One job of a comparison: an object stage, a run, or a policy's test on another task.
 
-`python -m sb3_follow_object.worker` does the job that standard input describes and tells how it
-goes in lines of JSON on standard output; whatever else is printed goes to standard error.
+`python -m sb3_follow_object.worker` does the job that the first line of standard input describes
+and tells how it goes in lines of JSON on standard output; whatever else is printed goes to standard
+error. It stops, with a checkpoint, when standard input ends: whoever started it is gone.
 """
 
 from __future__ import annotations
@@ -10,8 +11,10 @@ import json
 import os
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -79,6 +82,7 @@ def run_job(job: Job, send: Send) -> None:
         progress=lambda figures: send({"figures": figures}),
         command=job.command,
         object_stage_only=job.kind == STAGE,
+        wait=True,  # for the job of a comparison that was killed to write its checkpoint
     )
 
 
@@ -90,16 +94,15 @@ def one_line(error: BaseException) -> str:
 
 def main() -> int:
     """Do the job on standard input; return 0, 1 when it failed, 130 when it was stopped."""
-    job = Job(**json.load(sys.stdin))
+    job = Job(**json.loads(sys.stdin.readline()))
+    threading.Thread(target=_stop_when_alone, daemon=True).start()
     # The lines of JSON get the pipe for themselves: libraries print where they like.
     out = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
 
     def send(message: dict[str, Any]) -> None:
-        try:
+        with suppress(OSError):  # whoever started it is gone, which the thread above has noticed
             out.write(json.dumps(message) + "\n")
-        except OSError:  # whoever started the comparison is gone: stop, with a checkpoint
-            os.kill(os.getpid(), signal.SIGTERM)
 
     try:
         run_job(job, send)
@@ -110,6 +113,13 @@ def main() -> int:
         send({"failed": one_line(error)})
         return FAILURE
     return 0
+
+
+def _stop_when_alone() -> None:
+    """Wait until nobody holds the other end of standard input, then stop this process."""
+    while os.read(0, 1):  # not sys.stdin, whose lock a thread must not hold when Python ends
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 if __name__ == "__main__":

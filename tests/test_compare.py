@@ -16,11 +16,12 @@ from result_folders import finish
 
 from sb3_follow_object import cli
 from sb3_follow_object.compare import Comparison, share_cores
+from sb3_follow_object.config import parse_override
 from sb3_follow_object.cross import CROSS_TESTS
 from sb3_follow_object.executors import LocalExecutor, Message
 from sb3_follow_object.experiment import OBJECT_STAGE, POLICY, RESULT
 from sb3_follow_object.files import lock
-from sb3_follow_object.grid import Cell, Settings, plan, read_grid
+from sb3_follow_object.grid import Cell, Settings, plan, prepare, read_grid
 from sb3_follow_object.grid_display import GridDisplay
 from sb3_follow_object.worker import CROSS, STAGE, TRAIN, Job
 
@@ -41,8 +42,9 @@ class FakeExecutor:
         self._told: list[tuple[str, Message]] = []
 
     def start(self, job: Job) -> None:
+        told = self.do(job)
         self.jobs.append(job)
-        self._told += [(job.name, message) for message in self.do(job)]
+        self._told += [(job.name, message) for message in told]
         self.most = max(self.most, sum("finished" in message for _, message in self._told))
 
     def messages(self, timeout: float) -> list[tuple[str, Message]]:
@@ -190,6 +192,19 @@ def test_signal_stops_the_jobs_and_the_next_call_goes_on(tmp_path: Path, signum:
     assert {cell["failures"] for cell in grid["cells"].values()} == {0}, "a stop is no failure"
 
 
+def test_what_cannot_be_started_stops_the_others(tmp_path: Path) -> None:
+    def start(job: Job) -> list[Message]:
+        if executor.jobs:
+            raise OSError(28, "No space left on device")
+        return []
+
+    executor = FakeExecutor(start)
+    work, _ = comparison(tmp_path, executor, small_plan(tmp_path, ("her",)))
+    with pytest.raises(OSError, match="No space left"):
+        work.run()
+    assert executor.stops == 1
+
+
 def test_versions_of_pnp_simple_are_tested_on_each_other(tmp_path: Path) -> None:
     executor = FakeExecutor(do_it)
     cells = plan(tmp_path, ["PnPSimpleV1", "PnPSimpleV2", "PnPShelf"], ["her"], [0], SETTINGS)
@@ -267,6 +282,20 @@ def test_worker_that_raises_or_dies_says_why(
     executor.start(Job(TRAIN, "dies", str(tmp_path)))
     expected = "killed by signal 9; the log's last line: almost there"
     assert finished_job(executor) == {"failed": expected}
+
+
+def test_worker_stops_with_a_checkpoint_when_its_comparison_is_gone(tmp_path: Path) -> None:
+    overrides = dict(parse_override(text) for text in TINY)
+    (cell,) = plan(tmp_path, ["PushSideGap"], ["her"], [0], Settings(100_000, overrides=overrides))
+    prepare(cell, None)
+    executor = LocalExecutor(1, tmp_path / "logs")
+    executor.start(Job(TRAIN, cell.name, str(cell.folder)))
+    while not any("figures" in message for _, message in executor.messages(1.0)):
+        pass
+    child = executor._children[cell.name]
+    child.stdin.close()  # type: ignore[union-attr]  # as the system does when a process dies
+    assert finished_job(executor) == {"stopped": True}
+    assert list(cell.folder.glob("checkpoint*"))
 
 
 def test_real_run_is_stopped_resumed_and_ends(

@@ -118,6 +118,7 @@ def test_cross_test_keeps_the_figure_and_refuses_what_cannot_be(
     run = results / "PnPSimpleV2-her-0"
     assert cross_test(run, "FollowObject/PnPSimpleV1-v0", 12) == 0.5
     assert asked[0][1:] == ("FollowObject/PnPSimpleV1-v0", 12, 0)
+    assert cross_test(run, "FollowObject/PnPSimpleV1-v0", 4) == 0.5, "kept is the longer test"
     assert read_cross_tests(run) == {"PnPSimpleV1": {"success_rate": 0.5, "episodes": 12}}
     with pytest.raises(ValueError, match="did you mean 'FollowObject/PnPSimpleV1-v0'"):
         cross_test(run, "FollowObject/PnPSimplV1-v0")

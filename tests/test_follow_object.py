@@ -99,6 +99,65 @@ def test_resumed_equals_uninterrupted(
     np.testing.assert_array_equal(weights(resumed), weights(whole))
 
 
+def test_small_save_trains_on_from_empty_replay(predictor: GoalPredictor, tmp_path: Path) -> None:
+    run = FollowObject(ENV, predictor=predictor, **TINY)
+    run.learn(600)
+    run.save(tmp_path / "run", replay_buffer=False)
+    loaded = FollowObject.load(tmp_path / "run")
+    assert loaded.model is not None and run.model is not None
+    before = float(loaded.model.moments.count)
+    assert before == float(run.model.moments.count)
+    loaded.learn(run.env_steps + 200)
+    stored = loaded.model.replay_buffer.pos * loaded.env.num_envs  # type: ignore[union-attr]
+    # A row as shown and one as achieved for each transition, and nothing of the empty slots.
+    assert float(loaded.model.moments.count) == pytest.approx(before + 2 * stored)
+    assert (loaded.model.moments.var > 0.0).all()
+
+
+def test_save_replaces_everything_of_an_earlier_one(
+    predictor: GoalPredictor, tmp_path: Path
+) -> None:
+    settings = {**TINY, "predictor_fit": {"hidden": (8,), "epochs": 1}, "object_timesteps": 800}
+    other = FollowObject(ENV, seed=1, **settings).object_stage.learn_predictor()
+    start, goal, k = np.full((1, 3), 0.5), np.full((1, 3), 0.6), np.array([3])
+    for each in (predictor, other):
+        run = FollowObject(ENV, predictor=each, **TINY)
+        run.save(tmp_path / "run")
+        loaded = FollowObject.load(tmp_path / "run").predictor
+        assert loaded is not None
+        np.testing.assert_array_equal(loaded.predict(start, goal, k), each.predict(start, goal, k))
+    FollowObject(ENV, imagine=False, **TINY).save(tmp_path / "run")
+    assert FollowObject.load(tmp_path / "run").predictor is None
+
+
+def test_save_keeps_train_freq_and_refuses_python_objects(
+    predictor: GoalPredictor, tmp_path: Path
+) -> None:
+    algorithm = {**TINY["algorithm"], "train_freq": (1, "episode")}
+    run = FollowObject(ENV, predictor=predictor, **{**TINY, "algorithm": algorithm})
+    run.learn(300)
+    run.save(tmp_path / "run")
+    loaded = FollowObject.load(tmp_path / "run")
+    np.testing.assert_array_equal(weights(loaded), weights(run))
+
+    kwargs = {"policy_kwargs": {"activation_fn": th.nn.Tanh}}
+    run = FollowObject(ENV, imagine=False, **{**TINY, "algorithm": kwargs})
+    with pytest.raises(ValueError, match="settings cannot be saved"):
+        run.save(tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_function_is_a_callback(predictor: GoalPredictor) -> None:
+    calls: list[int] = []
+
+    def count(local: dict[str, Any], others: dict[str, Any]) -> bool:
+        calls.append(1)
+        return True
+
+    FollowObject(ENV, predictor=predictor, **TINY).learn(300, callback=count)
+    assert calls
+
+
 def test_run_folder_resumes_and_is_evaluated_again(
     predictor: GoalPredictor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,7 +46,9 @@ def test_command_trains_the_same_run(tmp_path: Path) -> None:
     (cell,) = plan(tmp_path, ["PushDoubleObstacles"], ["fo"], [4], settings)
     assert cell.config.eval_every == 1900 * 80
     assert cell.config.n_eval_episodes == 380
-    words = "--method fo --seed 4 --steps 1000 --set eval_every=152000 n_eval_episodes=380"
+    words = (
+        "--method fo --seed 4 --threads 1 --steps 1000 --set eval_every=152000 n_eval_episodes=380"
+    )
     assert f"{words} curriculum.p=0.5" in cell.command
 
 

@@ -236,6 +236,22 @@ def test_actor_file_needs_no_training_code(tmp_path: Any) -> None:
         load_actor(tmp_path / "actor", *spaces)  # type: ignore[arg-type]
 
 
+def test_actor_file_keeps_clip_and_activation(tmp_path: Any) -> None:
+    model = make_model(policy_kwargs={"features_clip": 0.5, "activation_fn": th.nn.Tanh})
+    model.learn(80, log_interval=None)  # type: ignore[arg-type]
+    save_actor(tmp_path / "actor", model.actor, "Point-v0")
+    actor, _ = load_actor(tmp_path / "actor", model.observation_space, model.action_space)  # type: ignore[arg-type]
+    obs = model.env.reset()  # type: ignore[union-attr]
+    np.testing.assert_array_equal(
+        actor.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
+        model.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
+    )
+    odd = make_model(policy_kwargs={"activation_fn": th.nn.Hardswish})
+    with pytest.raises(ValueError, match="can name the activations ReLU, Tanh"):
+        save_actor(tmp_path / "odd", odd.actor, "Point-v0")
+    assert not (tmp_path / "odd").exists()
+
+
 def test_environment_without_goals_is_refused() -> None:
     with pytest.raises(ValueError, match="lack achieved_goal, desired_goal, observation"):
         HerDDPG("MultiInputPolicy", gym.make("Pendulum-v1"))

@@ -12,6 +12,7 @@ import pytest
 
 from sb3_follow_object import extras
 from sb3_follow_object.cli import main
+from sb3_follow_object.ray_executor import _write_files
 
 TINY = ["policy_kwargs.net_arch=[8]", "batch_size=16", "gradient_steps=2", "n_envs=2"]
 TINY += ["object_timesteps=800", "n_paths=16", "predictor_fit.epochs=1", "predictor_fit.hidden=[8]"]
@@ -68,6 +69,22 @@ def test_run_that_raises_on_a_node_is_tried_twice_and_reported(
     assert "1 of 1 runs failed: PushSideGap-her-0" in printed.err
     assert "it failed twice" in printed.out
     assert "| PushSideGap | failed |" in printed.out
+
+
+def test_more_threads_than_a_node_has_are_refused(
+    cluster: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["compare", "--out", str(tmp_path / "new"), "--tasks", "PushSideGap", "--threads", "2"]
+    assert main([*words, "--methods", "her", "--ray", cluster.address]) == 2
+    assert "has 2 cores for a run, the largest has 1" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_only_files_that_went_along_are_removed(tmp_path: Path) -> None:
+    for name in ("sent", "made_here"):
+        (tmp_path / name).write_text("old")
+    _write_files(tmp_path, {"made/there": b"new"}, gone={"sent"})
+    assert {path.name for path in tmp_path.rglob("*")} == {"made_here", "made", "there"}
 
 
 def test_ray_that_is_not_installed_is_one_sentence(

@@ -10,6 +10,7 @@ import pytest
 from result_folders import write_grid, write_run
 
 from sb3_follow_object import extras
+from sb3_follow_object.experiment import trained_steps
 from sb3_follow_object.results import (
     across_tasks,
     csv_table,
@@ -135,5 +136,8 @@ def test_folder_without_runs_and_damaged_results_are_refused(tmp_path: Path) -> 
         read_results(tmp_path / "none")
     run = write_run(tmp_path, "PnPShelf", "fo", 0, 0.5)
     (run / "result.json").write_text('{"env_steps": 3}')
-    with pytest.raises(ValueError, match="is not the result of a run"):
-        read_results(tmp_path)
+    for content in ('{"env_steps": 3}', "{}", "[1]", "{"):
+        (run / "result.json").write_text(content)
+        for read in (lambda: read_results(tmp_path), lambda: trained_steps(run)):
+            with pytest.raises(ValueError, match="is not the result of a run"):
+                read()
