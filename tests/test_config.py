@@ -17,6 +17,7 @@ from sb3_follow_object.config import (
     METHODS,
     PRESETS,
     WRAPPER,
+    _schema,
     load_config,
     parse_override,
     preset_file,
@@ -291,6 +292,20 @@ def test_damaged_configuration_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match="is not the configuration of a run"):
         load_config(tmp_path)
+
+
+def test_docs_name_every_setting_of_runs_and_stages() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "runs.md").read_text()
+    schema = _schema()
+    missing = [
+        name for kind in ("run", "class") for name in schema[kind] if f"`{name}`" not in text
+    ]
+    assert not missing
+    for name in ("curriculum", "predictor_fit"):
+        assert not [part for part in schema["class"][name] if f"`{part}`" not in text]
+    for name, default in schema["run"].items():
+        shown = json.dumps(default).removesuffix(".0")
+        assert f"| `{name}` | {shown} |" in text
 
 
 def test_each_ablation_of_the_docs_changes_one_setting() -> None:
