@@ -90,7 +90,19 @@ def _sentence(error: Exception) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog=PROGRAM, description="Follow the Object for Stable-Baselines3.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_train(commands)
+    _add_about_runs(commands)
+    _add_compare(commands)
 
+    predictor = commands.add_parser("predictor", help="learn F_phi alone, stages one and two")
+    predictor.set_defaults(run_command=_predictor, method="fo")
+    predictor.add_argument("--out", type=Path, required=True, metavar="FOLDER")
+    _add_settings(predictor)
+    return parser
+
+
+def _add_train(commands: Any) -> None:
+    """Add the command that trains in a run folder."""
     train = commands.add_parser("train", help="train a robot in a run folder")
     train.set_defaults(run_command=_train)
     train.add_argument("--run", type=Path, required=True, metavar="FOLDER", help="run folder")
@@ -113,6 +125,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     train.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
+
+def _add_about_runs(commands: Any) -> None:
+    """Add the commands that test, film and draw what is in run folders."""
     evaluate = commands.add_parser("evaluate", help="test a run's policy on original goals")
     evaluate.set_defaults(run_command=_evaluate)
     evaluate.add_argument("run", type=Path, help="folder with policy.safetensors and config.json")
@@ -142,14 +157,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PATH",
         help=f"PNG, default: RUN/{CURVE}, or of several {CURVE}; of --results a folder",
     )
-
-    _add_compare(commands)
-
-    predictor = commands.add_parser("predictor", help="learn F_phi alone, stages one and two")
-    predictor.set_defaults(run_command=_predictor, method="fo")
-    predictor.add_argument("--out", type=Path, required=True, metavar="FOLDER")
-    _add_settings(predictor)
-    return parser
 
 
 def _add_compare(commands: Any) -> None:

@@ -131,15 +131,18 @@ def train(
                 )
             if object_stage_only:
                 return {}
-            return _run_stages(
-                config, folder, run, loaded, wall_before, checkpoints, stop, progress, command
+            wall_s = _robot_stage(
+                config, folder, run, loaded, wall_before, checkpoints, stop, progress
             )
+            result = _final_test(config, folder, run, wall_s, stop, command)
+            checkpoints.remove(keep_last=config.keep_last_checkpoint)
+            return result
         except Exception as error:
             checkpoints.wait()
             raise _stopped(error, run, folder) from error
 
 
-def _run_stages(
+def _robot_stage(
     config: RunConfig,
     folder: Path,
     run: FollowObject,
@@ -148,9 +151,8 @@ def _run_stages(
     checkpoints: Checkpoints,
     stop: StopSignals,
     progress: Progress,
-    command: str,
-) -> dict[str, Any]:
-    """Run what is left of the robot's stage and of the final test."""
+) -> float:
+    """Run what is left of the robot's stage; return the seconds that all stages took."""
     saved = loaded.pop()
     if saved is not None and saved["stage"] != "robot":
         saved = None
@@ -182,7 +184,18 @@ def _run_stages(
     )
     run.learn(config.total_timesteps, callback=CallbackList([evaluation, keeper, writer]))
     eval_env.close()
+    return evaluation.wall_s
 
+
+def _final_test(
+    config: RunConfig,
+    folder: Path,
+    run: FollowObject,
+    wall_s: float,
+    stop: StopSignals,
+    command: str,
+) -> dict[str, Any]:
+    """Test the policy that was kept on fresh episodes; write the run's result and return it."""
     run.save_policy(folder / LAST_POLICY)
     if not (folder / POLICY).exists():
         run.save_policy(folder / POLICY)
@@ -197,14 +210,13 @@ def _run_stages(
         "env_steps": run.env_steps,
         "object_steps": run.object_steps,
         "test_steps": run.test_steps,
-        "wall_s": round(evaluation.wall_s, 1),
+        "wall_s": round(wall_s, 1),
         "success_rate": episodes.success_rate,
         "episodes": config.n_final_episodes,
         "command": noted_command(folder, command),
         "k_max": run.curriculum.k_max if run.imagine else None,
     }
     atomic_write(folder / RESULT, json.dumps(result, indent=2).encode())
-    checkpoints.remove(keep_last=config.keep_last_checkpoint)
     return result
 
 

@@ -38,7 +38,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def accepted(*arguments: Any, **options: Any) -> None:
         raise AssertionError("the input was accepted")  # rather than trained for hours
 
-    monkeypatch.setattr(experiment, "_run_stages", accepted)
+    monkeypatch.setattr(experiment, "_robot_stage", accepted)
     monkeypatch.setattr(ObjectStage, "learn_predictor", accepted)
     return tmp_path
 
