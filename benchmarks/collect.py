@@ -5,8 +5,8 @@
 A row of summary.csv is replaced by a run of the same task, method and seed. Each run's policy,
 predictor, configuration, versions and learning curve are copied beside it, so that
 `sb3-follow-object evaluate benchmarks/results/<run>` tests it again. README's table is drawn from
-summary.csv: medians over seeds. Its figure, the paper's figures and the tables of final success are
-drawn from the copied runs.
+summary.csv: medians over seeds. Its figures, the paper's figures and the tables of final success
+are drawn from the copied runs.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from statistics import median
 
 from sb3_follow_object.cross import CROSS_TESTS
 from sb3_follow_object.figures import FINAL_SUCCESS, draw_results
+from sb3_follow_object.plots import draw_curves
 from sb3_follow_object.results import read_results, write_tables
 
 RESULTS = Path(__file__).parent / "results"
@@ -43,6 +44,8 @@ FIGURE = (
     "\n![Final success of every method on every task; hatched where there is none]"
     f"(benchmarks/results/figures/{FINAL_SUCCESS})\n"
 )
+# README's curves, of all seeds of FO and HER.
+FEATURED = {"PnPSimpleV2": "pnp-simple-v2.png", "PnPShelf": "pnp-shelf.png"}
 KEPT = ("config.json", "result.json", "versions.json", "evaluations.csv", "policy.safetensors")
 
 
@@ -109,6 +112,9 @@ def main() -> None:
         writer.writerows(ordered := [rows[key] for key in sorted(rows)])
     write_tables(read_results(RESULTS), RESULTS)
     draw_results(RESULTS, RESULTS / "figures")
+    for task, name in FEATURED.items():
+        wanted = [key for key in sorted(rows) if key[0] == task and key[1] in ("fo", "her")]
+        draw_curves([RESULTS / "-".join(key) for key in wanted], RESULTS / name)
     text = README.read_text()
     head, rest = text.split(BEGIN)
     README.write_text(head + BEGIN + table(ordered) + FIGURE + END + rest.split(END)[1])
