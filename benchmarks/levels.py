@@ -3,8 +3,8 @@
     python benchmarks/levels.py benchmarks/results/PnPInsertion-fo-0 --levels 5 10 15 20 22 24
 
 Prints a row a level: success on the imagined goal, and how far from the original goal the object
-came to rest (medians, metres, level and vertical). Noise-free episodes of the policy that the run
-kept, from a stream of their own.
+came to rest (medians, metres, level and vertical). Noise-free episodes of the run's policy, from a
+stream of their own.
 """
 
 from __future__ import annotations

@@ -29,7 +29,6 @@ from .run_callbacks import CheckpointCallback, Progress, RunCallback, StopSignal
 from .run_folder import (
     CONFIG,
     EVALUATIONS,
-    LAST_POLICY,
     OBJECT_STAGE,
     POLICY,
     PREDICTOR,
@@ -195,11 +194,9 @@ def _final_test(
     stop: StopSignals,
     command: str,
 ) -> dict[str, Any]:
-    """Test the policy that was kept on fresh episodes; write the run's result and return it."""
-    run.save_policy(folder / LAST_POLICY)
-    if not (folder / POLICY).exists():
-        run.save_policy(folder / POLICY)
-    run.report(f"final test of the policy kept: {config.n_final_episodes} episodes")
+    """Test the last policy on fresh episodes; write the run's result and return it."""
+    run.save_policy(folder / POLICY)
+    run.report(f"final test: {config.n_final_episodes} episodes")
     episodes = evaluate(
         folder / POLICY, config.env_id, config.n_final_episodes, config.seed, stop.check
     )

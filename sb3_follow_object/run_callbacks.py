@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from .callbacks import OriginalGoalEvalCallback
 from .follow_object import FollowObject
-from .run_folder import POLICY, Checkpoints
+from .run_folder import BEST_POLICY, POLICY, Checkpoints
 
 Progress = Callable[[dict[str, Any]], None]
 
@@ -92,7 +92,7 @@ class CheckpointCallback(BaseCallback):
 
 
 class RunCallback(BaseCallback):
-    """Keeps the best validated policy and reports progress.
+    """Saves the policy at each validation, and the best one apart, and reports progress.
 
     Args:
         run: what is trained.
@@ -128,9 +128,10 @@ class RunCallback(BaseCallback):
             self._n_validated = n_validated
             rate = self.evaluation.success_rate
             assert rate is not None
+            self.run.save_policy(self.folder / POLICY)
             if rate >= self.best:
                 self.best = rate
-                self.run.save_policy(self.folder / POLICY)
+                self.run.save_policy(self.folder / BEST_POLICY)
             self.logger.dump(self.run.env_steps)
         self.progress(
             {

@@ -25,7 +25,7 @@ from .predictor_files import FACTS_FILE
 
 CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
 PREDICTOR, OBJECT_STAGE = "predictor", "object_stage.json"
-POLICY, LAST_POLICY = "policy.safetensors", "last_policy.safetensors"
+POLICY, BEST_POLICY = "policy.safetensors", "best_policy.safetensors"
 CHECKPOINTS = "checkpoint-*.safetensors"
 COMMAND = "command.txt"  # what started the run, and what gave it other steps later
 PACKAGES = ["sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics"]
@@ -53,8 +53,8 @@ class RunConfig:
         settings: keyword arguments of `FollowObject` besides env_id and seed.
         eval_every: env steps between two validations on original goals, >= 1.
         n_eval_episodes: episodes a validation, >= 1; its steps are not counted, nothing learns
-            from them, but the policy that is kept is the last one that validated best.
-        n_final_episodes: fresh episodes of the final test of the kept policy, >= 1.
+            from them.
+        n_final_episodes: fresh episodes of the last policy's final test, >= 1.
         checkpoint_minutes: wall time between two checkpoints, > 0; does not change the result.
         keep_checkpoints: how many of the last checkpoints are kept, >= 1.
         keep_last_checkpoint: whether a finished run keeps one, to be given more steps later.

@@ -32,7 +32,7 @@ def test_run_depends_on_its_seed_alone(n_envs: int, tmp_path: Path) -> None:
     threaded = outcome(tmp_path / "threaded", n_envs=n_envs, n_threads=2)
     assert threaded == first
     other = outcome(tmp_path / "other", seed=1, n_envs=n_envs, n_threads=1)
-    assert other["last_policy.safetensors"] != first["last_policy.safetensors"]
+    assert other["policy.safetensors"] != first["policy.safetensors"]
 
 
 def test_settings_given_are_not_written_into() -> None:

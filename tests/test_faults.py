@@ -65,7 +65,7 @@ def test_environment_that_fails_in_mid_episode(env_id: str, sentence: str, tmp_p
     result = train(config(env_id), tmp_path / "run", resume=True, report=runs.quiet)
     assert result["env_steps"] == 200
     train(config("Good-v0"), tmp_path / "good", report=runs.quiet)
-    kept = [(tmp_path / name / "last_policy.safetensors") for name in ("run", "good")]
+    kept = [(tmp_path / name / "policy.safetensors") for name in ("run", "good")]
     first, second = (load_tree(path)["actor"] for path in kept)
     assert all((first[name] == second[name]).all() for name in first)
 

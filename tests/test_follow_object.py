@@ -182,7 +182,7 @@ def test_run_folder_resumes_and_is_evaluated_again(
     resumed = train(config, tmp_path / "part", resume=True, report=lambda sentence: None)
     for key in ("env_steps", "object_steps", "test_steps", "success_rate", "k_max"):
         assert resumed[key] == whole[key]
-    for name in ("policy.safetensors", "last_policy.safetensors"):
+    for name in ("policy.safetensors", "best_policy.safetensors"):
         assert (tmp_path / "part" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
     def without_wall(folder: str) -> list[list[str]]:
@@ -258,7 +258,7 @@ def test_preset_learns_what_the_run_folder_learns(method: str, tmp_path: Path) -
     run = FollowObject.from_preset(ENV, method=method, seed=5, overrides=small)
     run.learn(600)
     run.save_policy(tmp_path / "policy.safetensors")
-    ours, theirs = tmp_path / "policy.safetensors", tmp_path / "run" / "last_policy.safetensors"
+    ours, theirs = tmp_path / "policy.safetensors", tmp_path / "run" / "policy.safetensors"
     assert ours.read_bytes() == theirs.read_bytes()
 
 

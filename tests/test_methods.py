@@ -98,7 +98,7 @@ def test_trains_logs_and_resumes_exactly(method: str, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         train(config, tmp_path / "part", report=quiet, progress=interrupt)
     train(config, tmp_path / "part", resume=True, report=quiet)
-    policies = [(tmp_path / run / "last_policy.safetensors").read_bytes() for run in RUNS]
+    policies = [(tmp_path / run / "policy.safetensors").read_bytes() for run in RUNS]
     assert policies[0] == policies[1]
     assert logged(tmp_path / "part")[-1] == rows[-1]
 
@@ -133,9 +133,7 @@ def test_sldr_counts_of_a_shared_object_stage_what_it_uses(tmp_path: Path) -> No
         (tmp_path / "stage" / name).rename(tmp_path / "shared" / name)
     shared = train(config, tmp_path / "shared", resume=True, report=quiet)
     assert shared["object_steps"] == alone["object_steps"] == OBJECT_STEPS["sldr"]
-    policies = [
-        (tmp_path / n / "last_policy.safetensors").read_bytes() for n in ("alone", "shared")
-    ]
+    policies = [(tmp_path / n / "policy.safetensors").read_bytes() for n in ("alone", "shared")]
     assert policies[0] == policies[1]
     assert needs_object_stage(config) and needs_object_stage(both)
     assert not needs_object_stage(tiny_run("rnd"))
