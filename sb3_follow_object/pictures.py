@@ -50,7 +50,7 @@ def draw_imagined(
         env_id: a task of this package.
         predictor: its F_phi.
         out: PNG file to create or replace.
-        seed: of the first episode, at least 0.
+        seed: of the first episode.
 
     Raises:
         MissingExtra: imageio is not installed.
@@ -83,7 +83,7 @@ def record(
         env_id: the task.
         out: MP4 file to create or replace.
         n_episodes: at least 1.
-        seed: of the first episode.
+        seed: of the first episode, at least 0.
 
     Raises:
         MissingExtra: imageio or its ffmpeg is not installed.

@@ -47,6 +47,10 @@ def own() -> Iterator[Task]:
     """The task, forgotten again afterwards: other tests go through all ids."""
     run_config(FULL, method="her")
     yield TASKS[NAME]
+    forget()
+
+
+def forget() -> None:
     for env_id in (OWN, object_id(OWN)):
         gym.registry.pop(env_id)
         del IDS[env_id]
@@ -56,6 +60,7 @@ def own() -> Iterator[Task]:
 def test_its_environments_are_like_the_packages(own: Task) -> None:
     assert register_task(replace(own)) == OWN, "an equal task may be registered again"
     for env_id in (OWN, object_id(OWN)):
+        # The check of drawing opens a window; test_envs.py draws without one.
         check_env(gym.make(env_id).unwrapped, skip_render_check=True)
         assert gym.make(env_id).spec.max_episode_steps == own.horizon  # type: ignore[union-attr]
     venv = make_vec(FULL, 2, 1, seed=0)
@@ -143,9 +148,5 @@ def test_commands_train_resume_and_test_it_in_processes_of_their_own(tmp_path: P
     assert done.returncode == 2 and "on PYTHONPATH" in done.stderr
 
     # And through Python, where the configuration tells the module.
-    sys.modules.pop(MODULE, None)
     assert load_config(run).full_id == FULL
-    for env_id in (OWN, object_id(OWN)):
-        gym.registry.pop(env_id)
-        del IDS[env_id]
-    del TASKS[NAME], sys.modules[MODULE]
+    forget()
