@@ -2,10 +2,12 @@
 
     python benchmarks/speed.py            # or: make bench
     python benchmarks/speed.py --only learner --rounds 3
+    python benchmarks/speed.py --only gpu --out benchmarks/gpu.json
 
 Each figure is measured in turn with its baseline, round after round, in this one process, and the
 medians are compared: on a shared machine the ratio holds where the rates drift. Nothing else should
-run meanwhile. Writes benchmarks/speed.json and benchmarks/throughput.png.
+run meanwhile. Writes benchmarks/speed.json and benchmarks/throughput.png; a part alone is written
+where --out says. "gpu", the learner on CUDA, is measured only when it is asked for.
 """
 
 from __future__ import annotations
@@ -141,7 +143,7 @@ def throughput(out: Path) -> list[dict[str, float]]:
 # ---- replay --------------------------------------------------------------------------------------
 
 
-def _fill(buffer: HerReplayBuffer, env: VecEnv, n_slots: int, horizon: int) -> None:
+def _fill(buffer: HerReplayBuffer, env: VecEnv, n_slots: int, horizon: int = 50) -> None:
     """Fill `n_slots` slots of every environment with random episodes."""
     rng = np.random.default_rng(0)
     shapes = {key: space.shape for key, space in env.observation_space.spaces.items()}  # type: ignore[attr-defined]
@@ -167,7 +169,7 @@ def replay() -> Iterator[Figure]:
             "cpu",
             n_envs,  # type: ignore[arg-type]
         )
-        _fill(buffer, env, size // n_envs, 50)
+        _fill(buffer, env, size // n_envs)
         buffers.append(buffer)
 
     def draws(buffer: HerReplayBuffer, n: int) -> Measure:
@@ -214,58 +216,75 @@ def update_flops(batch: int, inputs: int, actions: int) -> float:
     return (actor + critic) + 3.0 * critic + 3.0 * actor + 2.0 * critic
 
 
-def matmul_rate(precision: str) -> float:
-    """Floating-point operations a second of PyTorch's product of 1024 x 256 with 256 x 256."""
+def matmul_rate(precision: str, device: str) -> float:
+    """Floating-point operations a second of PyTorch's product of (rows, 256) with (256, 256)."""
     earlier = th.get_float32_matmul_precision()
     th.set_float32_matmul_precision(precision)
-    a, b = th.randn(1024, 256), th.randn(256, 256)
+    n_rows = 1024 if device == "cpu" else 4864
+    a, b = th.randn(n_rows, 256, device=device), th.randn(256, 256, device=device)
     rates = []
     for _ in range(20):
         started = time.perf_counter()
         for _ in range(20):
             th.mm(a, b)
-        rates.append(20 * 2.0 * 1024 * 256 * 256 / (time.perf_counter() - started))
+        _synchronise(device)
+        rates.append(20 * 2.0 * n_rows * 256 * 256 / (time.perf_counter() - started))
     th.set_float32_matmul_precision(earlier)
     return median(rates)
 
 
+def _synchronise(device: str) -> None:
+    """Wait for what a GPU was told to do."""
+    if device != "cpu":
+        th.cuda.synchronize()
+
+
 def _learner(model: Any, batch: int, n: int) -> Measure:
+    """Return a measure of gradient steps, `n` in a call as after a rollout."""
     model.set_logger(Logger(None, []))
+    calls = 5 if model.device.type == "cuda" and isinstance(model, HerDDPG) else 1
 
     def measure() -> float:
         started = time.perf_counter()
-        model.train(n, batch)
-        return n / (time.perf_counter() - started)
+        for _ in range(calls):
+            model.train(n, batch)
+        _synchronise(model.device.type)
+        return calls * n / (time.perf_counter() - started)
 
     return measure
 
 
-def learner() -> Iterator[Figure]:
-    """Whole updates, sampling included: default preset, its float32 twin, against stock DDPG."""
-    env = make_vec(ROBOT, 4, 1)
+def _learners(device: str, n_stored: int) -> dict[str, Any]:
+    """Stock DDPG + HER, the default preset, and that in float32, with so much in their replay."""
+    env = make_vec(ROBOT, 16 if device == "cpu" else 80, 1)
     entry = read_yaml(preset_file("her"))[ROBOT]
     kwargs = {
         key: value
         for key, value in entry.items()
         if key not in ("n_timesteps", "policy", "n_envs", "batch_size", "gradient_steps")
     }
-    kwargs |= {"learning_starts": 10**9, "seed": 0}
-    plain = {"policy_kwargs": {"net_arch": HIDDEN}, "seed": 0}
+    common = {"learning_starts": 10**9, "seed": 0, "device": device}
+    plain = {"policy_kwargs": {"net_arch": HIDDEN}, "replay_buffer_class": HerReplayBuffer}
     models: dict[str, Any] = {
-        "stock": DDPG(
-            "MultiInputPolicy",
-            env,
-            replay_buffer_class=HerReplayBuffer,
-            learning_starts=10**9,
-            **plain,  # type: ignore[arg-type]
+        "stock": DDPG("MultiInputPolicy", env, **plain, **common),  # type: ignore[arg-type]
+        "default": HerDDPG("MultiInputPolicy", env, **{**kwargs, **common}),
+        "float32": HerDDPG(
+            "MultiInputPolicy", env, **{**kwargs, **common, "matmul_precision": "highest"}
         ),
-        "default": HerDDPG("MultiInputPolicy", env, **kwargs),
-        "float32": HerDDPG("MultiInputPolicy", env, **{**kwargs, "matmul_precision": "highest"}),
     }
     for model in models.values():
-        model.learn(8_000, log_interval=None)
+        model.learn(800, log_interval=None)
+    for name in ("stock", "default"):
+        _fill(models[name].replay_buffer, env, n_stored // env.num_envs - 50)
+    models["float32"].replay_buffer = models["default"].replay_buffer
+    return models
+
+
+def learner(device: str = "cpu", n_stored: int = 8_000) -> Iterator[Figure]:
+    """Whole updates, sampling included: default preset, its float32 twin, against stock DDPG."""
+    models = _learners(device, n_stored)
     for batch in (256, 1024, 4864):
-        n = max(3, 12_000 // batch)
+        n = max(3, 12_000 // batch) if device == "cpu" else 40  # the paper's in a cycle
         for variant in ("default", "float32"):
             yield (
                 f"update, batch {batch}, {variant}",
@@ -275,11 +294,17 @@ def learner() -> Iterator[Figure]:
             )
 
 
-def arithmetic_share(figures: list[dict[str, Any]]) -> None:
+def gpu() -> Iterator[Figure]:
+    """The same on CUDA, from replay as full as the paper's."""
+    yield from learner("cuda", 1_000_000)
+
+
+def arithmetic_share(figures: list[dict[str, Any]], device: str) -> None:
     """Add to each update the share of the time that its matrix products need by themselves."""
     env = make_vec(ROBOT, 1, 1)
     inputs = sum(env.observation_space[key].shape[0] for key in ("observation", "desired_goal"))
-    rates = {"default": matmul_rate("medium"), "float32": matmul_rate("highest")}
+    variants = {"default": "medium", "float32": "highest"}
+    rates = {name: matmul_rate(precision, device) for name, precision in variants.items()}
     for figure in figures:
         if figure["name"].startswith("update"):
             variant = figure["name"].rsplit(" ", 1)[1]
@@ -339,30 +364,36 @@ def main() -> None:
     parts = {"simulation": simulation, "replay": replay, "learner": learner}
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--only", choices=parts, help="one part; writes no file")
+    parser.add_argument("--only", choices=[*parts, "gpu"], help="one part")
+    parser.add_argument("--out", type=Path, help="file for the figures of one part")
     arguments = parser.parse_args()
     chosen = [arguments.only] if arguments.only else list(parts)
+    device = "cuda" if arguments.only == "gpu" else "cpu"
 
     figures: list[dict[str, Any]] = []
     print(f"{'figure':34}{'ours':>12}  {'baseline':>12}  ratio")
     th.set_num_threads(1)  # a run's own setting: the cores are shared out between runs
     for part in chosen:
-        for figure in parts[part]():
+        for figure in {**parts, "gpu": gpu}[part]():
             for row in compare(figure, arguments.rounds):
                 figures.append(row)
                 print(_line(row), flush=True)
-    arithmetic_share(figures)
-    if arguments.only:
-        return
-    report = {
+    arithmetic_share(figures, device)
+    report: dict[str, Any] = {
         "figures": figures,
-        "replay_bytes_per_transition": replay_bytes(),
-        "throughput": throughput(HERE / "throughput.png"),
         "versions": {name: _version(name) for name in PACKAGES},
         "machine": {"processor": _processor(), "cores": CORES, "python": platform.python_version()},
     }
-    atomic_write(HERE / "speed.json", json.dumps(report, indent=2).encode() + b"\n")
-    print(f"written to {HERE / 'speed.json'}")
+    if device == "cuda":
+        report["machine"]["gpu"] = th.cuda.get_device_name()
+    out = arguments.out
+    if not arguments.only:
+        out = HERE / "speed.json"
+        report["replay_bytes_per_transition"] = replay_bytes()
+        report["throughput"] = throughput(HERE / "throughput.png")
+    if out is not None:
+        atomic_write(out, json.dumps(report, indent=2).encode() + b"\n")
+        print(f"written to {out}")
 
 
 def _processor() -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import safetensors.torch
 import torch
+from stable_baselines3.common.utils import get_device
 from torch import nn
 
 from .files import atomic_write
@@ -95,7 +96,8 @@ class GoalPredictor:
         """Fit F_phi to paths of the object policy by mean squared error (paper, equation 3).
 
         Whole paths are held out, so ``error_mm`` says how well unseen starts and goals are met.
-        The result depends on ``seed`` alone and no global random state is touched.
+        Done on a GPU where PyTorch sees one. The result depends on ``seed`` and the processor
+        alone, and no global random state is touched.
 
         Args:
             paths: object positions o_1..o_{T+1} of n episodes, shape (n, T+1, 3), metres.
@@ -132,17 +134,21 @@ class GoalPredictor:
         }
         network = _network(hidden)
         _initialise(network, generator)
+        x = (torch.from_numpy(inputs) - tensors["input_mean"]) / tensors["input_std"]
+        y = (torch.from_numpy(targets) - tensors["output_mean"]) / tensors["output_std"]
+        device = get_device("auto")
         _train(
-            network,
-            ((torch.from_numpy(inputs) - tensors["input_mean"]) / tensors["input_std"]).float(),
-            ((torch.from_numpy(targets) - tensors["output_mean"]) / tensors["output_std"]).float(),
+            network.to(device),
+            x.float().to(device),
+            y.float().to(device),
             learning_rate=learning_rate,
             batch_size=batch_size,
             epochs=epochs,
             generator=generator,
             progress=progress,
         )
-        tensors |= {name: value.detach().clone() for name, value in network.state_dict().items()}
+        weights = network.cpu().state_dict()
+        tensors |= {name: value.detach().clone() for name, value in weights.items()}
         predictor = cls(
             tensors,
             hidden=hidden,
@@ -316,8 +322,8 @@ def _train(
 ) -> None:
     optimiser = torch.optim.Adam(network.parameters(), lr=learning_rate)
     for epoch in range(1, epochs + 1):
-        order = torch.randperm(len(inputs), generator=generator)
-        total = torch.zeros(())
+        order = torch.randperm(len(inputs), generator=generator).to(inputs.device)
+        total = torch.zeros((), device=inputs.device)
         for x, y in zip(
             inputs[order].split(batch_size), targets[order].split(batch_size), strict=True
         ):

@@ -21,6 +21,7 @@ from stable_baselines3.common.type_aliases import (
     TrainFrequencyUnit,
 )
 
+from .acting import EarlierActor
 from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
 from .device_replay import DeviceReplay
 from .her_replay_buffer import FollowObjectReplayBuffer
@@ -32,6 +33,8 @@ SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 
 # Transitions drawn from the buffer in one call: enough to spread the fixed cost, small in memory.
 _SAMPLE_CHUNK = 32_768
+# On the learner's device, where memory is plenty and equal chunks replay one graph.
+_DEVICE_CHUNK = 262_144
 # Floor of the standard deviations, so that entries that hardly vary are not blown up.
 _MIN_STD = 0.01
 _PRECISIONS = ("highest", "high", "medium")
@@ -81,6 +84,8 @@ class HerDDPG(DDPG):
             and reward there, so that no batch is copied. None: on CUDA, where the buffer's settings
             and the environment's reward allow it (`DeviceReplay`). True: also on the CPU, and an
             error where they do not.
+        overlap: explore with the actor as it was before the last updates, so that a GPU updates it
+            while the CPU simulates. Tests, validations and what is saved have the updates.
         policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.
 
     The other arguments are DDPG's.
@@ -120,6 +125,7 @@ class HerDDPG(DDPG):
         matmul_precision: str = "highest",
         auxiliary: dict[str, Any] | None = None,
         replay_on_device: bool | None = None,
+        overlap: bool = False,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
@@ -176,6 +182,9 @@ class HerDDPG(DDPG):
         self.auxiliary = auxiliary
         self.auxiliary_critic: AuxiliaryCritic | None = None
         self.replay_on_device = replay_on_device
+        self.overlap = overlap
+        self.earlier: EarlierActor | None = None
+        self._told: th.Tensor | None = None  # means that are yet to be logged
         if _init_setup_model:
             self._setup_model()
 
@@ -205,6 +214,7 @@ class HerDDPG(DDPG):
             # Last, so that what is drawn above does not depend on it.
             rate = self.lr_schedule(1.0)
             self.auxiliary_critic = make_auxiliary(self.auxiliary, self.policy, rate, self.gamma)
+        self.earlier = EarlierActor(self.actor) if self.overlap else None
         self._updates = Updates(self)
         self._device_replay = self._make_device_replay()
         if isinstance(self.train_freq, TrainFreq) and (
@@ -252,7 +262,10 @@ class HerDDPG(DDPG):
         if self.num_timesteps < learning_starts:
             scaled = self.rng.uniform(-1.0, 1.0, size=(n_envs, *self.action_space.shape))
         else:
-            action, _ = self.actor.predict(self._last_obs, deterministic=True)
+            if self.earlier is not None:
+                action = self.earlier.act(self._last_obs)  # type: ignore[arg-type]
+            else:
+                action, _ = self.actor.predict(self._last_obs, deterministic=True)
             scaled = self.policy.scale_action(action)
             noise = (
                 self.rng.normal(0.0, self.noise_std, size=scaled.shape)
@@ -286,7 +299,7 @@ class HerDDPG(DDPG):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        names = ("auxiliary_critic", "_updates", "_device_replay")
+        names = ("auxiliary_critic", "_updates", "_device_replay", "earlier", "_told")
         return [*super()._excluded_save_params(), *names]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -294,6 +307,8 @@ class HerDDPG(DDPG):
         if self.auxiliary_critic is not None:
             names.append("auxiliary_critic")
             names += [f"auxiliary_critic.{name}" for name in self.auxiliary_critic.optimizers]
+        if self.earlier is not None:
+            names.append("earlier.actor")
         return names, variables
 
     def training_state(self) -> dict[str, Any]:
@@ -303,6 +318,7 @@ class HerDDPG(DDPG):
         """
         return {
             "policy": self.policy.state_dict(),
+            "earlier": None if self.earlier is None else self.earlier.actor.state_dict(),
             "actor_optimizer": self.actor.optimizer.state_dict(),
             "critic_optimizer": self.critic.optimizer.state_dict(),
             "auxiliary": None
@@ -325,6 +341,9 @@ class HerDDPG(DDPG):
     def load_training_state(self, state: dict[str, Any]) -> None:
         """Continue from `training_state` of an algorithm with the same networks."""
         self.policy.load_state_dict(state["policy"])
+        if self.earlier is not None:
+            self.earlier.actor.load_state_dict(state["earlier"])
+            self.earlier.follow(self.earlier.actor)
         self.actor.optimizer.load_state_dict(state["actor_optimizer"])
         self.critic.optimizer.load_state_dict(state["critic_optimizer"])
         if self.auxiliary_critic is not None:
@@ -368,11 +387,10 @@ class HerDDPG(DDPG):
         if self._device_replay is not None:
             assert isinstance(self.replay_buffer, FollowObjectReplayBuffer)
             self._device_replay.refresh(self.replay_buffer)
+        if self.earlier is not None:
+            self.earlier.follow(self.actor)
         told: list[th.Tensor] = []
-        steps_left = gradient_steps
-        while steps_left > 0:
-            n = min(steps_left, max(1, _SAMPLE_CHUNK // batch_size))
-            steps_left -= n
+        for n in self._chunks(gradient_steps, batch_size):
             data, steps_to_goal = self._sample(n * batch_size, n)
             bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
             # All networks share their input moments, so features are computed once.
@@ -390,14 +408,27 @@ class HerDDPG(DDPG):
         self.policy.update_average(decay if self.average_decay > 0.0 else 0.0)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, value in zip(COLUMNS, th.cat(told).mean(dim=0).tolist(), strict=True):
-            self.logger.record(f"train/{name}", value)
+        means = th.cat(told).mean(dim=0)
+        if self.overlap:  # reading them would wait for the updates; those before have ended
+            means, self._told = self._told, means
+        if means is not None:
+            for name, value in zip(COLUMNS, means.tolist(), strict=True):
+                self.logger.record(f"train/{name}", value)
         for name, mean in (auxiliary.take_log() if auxiliary else {}).items():
             self.logger.record(name, mean)
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
             self.logger.record("train/moved_share", self.replay_buffer.moved_share())
             for name, value in self.replay_buffer.selection_log().items():
                 self.logger.record(name, value)
+
+    def _chunks(self, gradient_steps: int, batch_size: int) -> list[int]:
+        """Gradient steps whose batches are drawn in one call, in turn."""
+        if self._device_replay is None:
+            most = max(1, _SAMPLE_CHUNK // batch_size)
+        else:
+            most = max(1, _DEVICE_CHUNK // batch_size)
+            most = -(-gradient_steps // max(1, -(-gradient_steps // most)))
+        return [min(most, gradient_steps - first) for first in range(0, gradient_steps, most)]
 
     def _sample(self, n: int, n_batches: int = 1) -> tuple[DictReplayBufferSamples, th.Tensor]:
         """Draw n transitions for so many batches, and (n, 1) steps until each goal was reached."""

@@ -213,14 +213,23 @@ class ImaginedGoalVecEnv(VecEnvWrapper):
             np.concatenate([achieved, achieved]),
             np.concatenate([self._shown, self._original]),
         ).reshape(2, -1)
+        facts = zip(
+            infos,
+            self._original.copy(),
+            self._level.tolist(),
+            success.astype(bool).tolist(),
+            original_success.astype(bool).tolist(),
+            strict=True,
+        )
         infos = [
             {
                 **info,
-                **self._facts(i),
-                "is_success": bool(success[i]),
-                "original_success": bool(original_success[i]),
+                "original_goal": original,
+                "imagined_level": level,
+                "is_success": reached,
+                "original_success": original_reached,
             }
-            for i, info in enumerate(infos)
+            for info, original, level, reached, original_reached in facts
         ]
         for i in ended:
             last = infos[i]["terminal_observation"]

@@ -142,10 +142,11 @@ def test_same_batch_same_weights_as_on_the_host(monkeypatch: pytest.MonkeyPatch)
     assert th.equal(weights(host), weights(device))
 
 
-def test_resumed_training_equals_uninterrupted() -> None:
-    model = make_model(replay_on_device=True)
+@pytest.mark.parametrize("overlap", [False, True])
+def test_resumed_training_equals_uninterrupted(overlap: bool) -> None:
+    model = make_model(replay_on_device=True, overlap=overlap)
     model.learn(400, log_interval=None)  # type: ignore[arg-type]
-    other = make_model(replay_on_device=True, seed=1)
+    other = make_model(replay_on_device=True, overlap=overlap, seed=1)
     other.learn(80, log_interval=None)  # type: ignore[arg-type]
     assert not th.equal(weights(model), weights(other))
     other.load_training_state(copy.deepcopy(model.training_state()))
@@ -157,6 +158,10 @@ def test_resumed_training_equals_uninterrupted() -> None:
         for each in (model, other):
             each.train(5, 64)
     assert th.equal(weights(model), weights(other))
+    if overlap:
+        assert model.earlier is not None and other.earlier is not None
+        obs: Any = model._last_obs
+        assert (model.earlier.act(obs) == other.earlier.act(obs)).all()
 
 
 def test_works_with_an_auxiliary_reward_and_after_sb3s_saving(tmp_path: Any) -> None:

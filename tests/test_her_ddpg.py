@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -274,3 +276,29 @@ def test_environment_without_goals_is_refused() -> None:
 def test_bad_arguments(arguments: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         make_model(**arguments)
+
+
+def test_overlap_explores_with_the_actor_before_the_last_updates() -> None:
+    model = make_model(overlap=True, noise_std=0.0, random_action_prob=0.0)
+    plain = make_model()
+    model.learn(400, log_interval=None)  # type: ignore[arg-type]
+    assert model.earlier is not None and plain.earlier is None
+    assert model._last_obs is not None
+    before = copy.deepcopy(model.actor)
+    model.train(10, 64)
+    explored, _ = model._sample_action(0, n_envs=4)
+    assert explored == pytest.approx(before.predict(model._last_obs, deterministic=True)[0])
+    newest, _ = model.predict(model._last_obs, deterministic=True)  # type: ignore[arg-type]
+    assert np.abs(explored - newest).max() > 1e-3
+
+
+def test_overlap_learns_and_survives_sb3s_saving(tmp_path: Path) -> None:
+    model = make_model(overlap=True, policy_kwargs={"net_arch": [64, 64]})
+    model.learn(4000, log_interval=None)  # type: ignore[arg-type]
+    assert success_rate(model) > 0.9
+    model.save(tmp_path / "model")
+    loaded = HerDDPG.load(tmp_path / "model", env=model.env)
+    obs: Any = model._last_obs
+    assert loaded.earlier is not None and model.earlier is not None
+    assert (loaded.earlier.act(obs) == model.earlier.act(obs)).all()
+    assert (loaded.earlier.act(obs) != loaded.predict(obs, deterministic=True)[0]).any()
