@@ -1,12 +1,28 @@
-"""The actor that explores while the one that learns is still being updated."""
+"""Exploring with an actor while the one that learns is still being updated."""
 
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch as th
 from stable_baselines3.td3.policies import Actor
+
+
+@dataclass
+class Phase:
+    """Gradient steps between two rollouts.
+
+    Attributes:
+        batch_size: transitions of a step.
+        chunks: steps whose batches are drawn together, in turn.
+        told: of the chunks that are done, what `Updates.run` returned.
+    """
+
+    batch_size: int
+    chunks: list[int]
+    told: list[th.Tensor] = field(default_factory=list)
 
 
 class EarlierActor:
@@ -23,7 +39,9 @@ class EarlierActor:
         self.actor = copy.deepcopy(actor)
         del self.actor.optimizer
         self.actor.requires_grad_(False)
-        self._stream = th.cuda.Stream(actor.device) if actor.device.type == "cuda" else None
+        on_gpu = actor.device.type == "cuda"
+        # Of high priority: asked in the midst of updates, it goes first.
+        self._stream = th.cuda.Stream(actor.device, priority=-1) if on_gpu else None
 
     @th.no_grad()
     def follow(self, actor: Actor) -> None:

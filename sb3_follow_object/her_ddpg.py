@@ -16,12 +16,13 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import (
     DictReplayBufferSamples,
     GymEnv,
+    MaybeCallback,
     Schedule,
     TrainFreq,
     TrainFrequencyUnit,
 )
 
-from .acting import EarlierActor
+from .acting import EarlierActor, Phase
 from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
 from .device_replay import DeviceReplay
 from .her_replay_buffer import FollowObjectReplayBuffer
@@ -84,8 +85,8 @@ class HerDDPG(DDPG):
             and reward there, so that no batch is copied. None: on CUDA, where the buffer's settings
             and the environment's reward allow it (`DeviceReplay`). True: also on the CPU, and an
             error where they do not.
-        overlap: explore with the actor as it was before the last updates, so that a GPU updates it
-            while the CPU simulates. Tests, validations and what is saved have the updates.
+        overlap: explore with the actor as it was before the updates since the last rollout, which a
+            GPU takes while the CPU simulates. Tests, validations and what is saved have them.
         policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.
 
     The other arguments are DDPG's.
@@ -184,7 +185,8 @@ class HerDDPG(DDPG):
         self.replay_on_device = replay_on_device
         self.overlap = overlap
         self.earlier: EarlierActor | None = None
-        self._told: th.Tensor | None = None  # means that are yet to be logged
+        self._phase: Phase | None = None  # gradient steps that are being taken
+        self._means: th.Tensor | None = None  # of the last phase, yet to be logged
         if _init_setup_model:
             self._setup_model()
 
@@ -263,6 +265,8 @@ class HerDDPG(DDPG):
             scaled = self.rng.uniform(-1.0, 1.0, size=(n_envs, *self.action_space.shape))
         else:
             if self.earlier is not None:
+                if self._phase is not None:
+                    self._go_on(self._phase)
                 action = self.earlier.act(self._last_obs)  # type: ignore[arg-type]
             else:
                 action, _ = self.actor.predict(self._last_obs, deterministic=True)
@@ -299,10 +303,11 @@ class HerDDPG(DDPG):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        names = ("auxiliary_critic", "_updates", "_device_replay", "earlier", "_told")
+        names = ("auxiliary_critic", "_updates", "_device_replay", "earlier", "_phase", "_means")
         return [*super()._excluded_save_params(), *names]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        self.finish_updates()
         names, variables = super()._get_torch_save_params()
         if self.auxiliary_critic is not None:
             names.append("auxiliary_critic")
@@ -311,11 +316,39 @@ class HerDDPG(DDPG):
             names.append("earlier.actor")
         return names, variables
 
+    def learn(
+        self: SelfHerDDPG,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "DDPG",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfHerDDPG:
+        """Learn as SB3's DDPG does."""
+        super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
+        self.finish_updates()
+        return self
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return actions as SB3's DDPG does."""
+        self.finish_updates()
+        return super().predict(observation, state, episode_start, deterministic)
+
     def training_state(self) -> dict[str, Any]:
         """Return everything that the next rollout and update depend on, between rollouts.
 
         The environment has its own state, and so has the replay buffer.
         """
+        self.finish_updates()
         return {
             "policy": self.policy.state_dict(),
             "earlier": None if self.earlier is None else self.earlier.actor.state_dict(),
@@ -373,12 +406,12 @@ class HerDDPG(DDPG):
         return float(low), float(high)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Take gradient steps; several batches are drawn from the buffer in one call."""
-        with matmul_at(self.matmul_precision):
-            self._train(gradient_steps, batch_size)
+        """Take gradient steps; several batches are drawn from the buffer in one call.
 
-    def _train(self, gradient_steps: int, batch_size: int) -> None:
+        With `overlap` they are begun here and go on as the next rollout does.
+        """
         assert self.replay_buffer is not None
+        self.finish_updates()
         self.policy.set_training_mode(True)
         auxiliary = self.auxiliary_critic
         optimizers = [self.actor.optimizer, self.critic.optimizer]
@@ -387,11 +420,22 @@ class HerDDPG(DDPG):
         if self._device_replay is not None:
             assert isinstance(self.replay_buffer, FollowObjectReplayBuffer)
             self._device_replay.refresh(self.replay_buffer)
+        self._phase = Phase(batch_size, self._chunks(gradient_steps, batch_size))
         if self.earlier is not None:
             self.earlier.follow(self.actor)
-        told: list[th.Tensor] = []
-        for n in self._chunks(gradient_steps, batch_size):
-            data, steps_to_goal = self._sample(n * batch_size, n)
+        else:
+            self.finish_updates()
+
+    def finish_updates(self) -> None:
+        """Take the gradient steps that `train` has begun and left to the next rollout, if any."""
+        while self._phase is not None:
+            self._go_on(self._phase)
+
+    def _go_on(self, phase: Phase) -> None:
+        """Take the next chunk's gradient steps; the last one's end the phase."""
+        n = phase.chunks[len(phase.told)]
+        with matmul_at(self.matmul_precision):
+            data, steps_to_goal = self._sample(n * phase.batch_size, n)
             bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
             # All networks share their input moments, so features are computed once.
             chunk = Transitions(
@@ -401,24 +445,31 @@ class HerDDPG(DDPG):
                 self.actor.features_extractor(data.observations),
                 self.actor.features_extractor(data.next_observations),
             )
-            told.append(self._updates.run(chunk, data.rewards, data.dones, bounds, batch_size))
-
+            phase.told.append(
+                self._updates.run(chunk, data.rewards, data.dones, bounds, phase.batch_size)
+            )
+        if len(phase.told) < len(phase.chunks):
+            return
+        self._phase = None
         # A plain mean until there are enough updates for the share to be left.
-        decay = min(self.average_decay**gradient_steps, 1.0 - gradient_steps / self._n_updates)
+        n = sum(phase.chunks)
+        decay = min(self.average_decay**n, 1.0 - n / self._n_updates)
         self.policy.update_average(decay if self.average_decay > 0.0 else 0.0)
+        self._log(th.cat(phase.told).mean(dim=0))
 
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        means = th.cat(told).mean(dim=0)
+    def _log(self, means: th.Tensor | None) -> None:
         if self.overlap:  # reading them would wait for the updates; those before have ended
-            means, self._told = self._told, means
+            means, self._means = self._means, means
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if means is not None:
             for name, value in zip(COLUMNS, means.tolist(), strict=True):
                 self.logger.record(f"train/{name}", value)
+        auxiliary, buffer = self.auxiliary_critic, self.replay_buffer
         for name, mean in (auxiliary.take_log() if auxiliary else {}).items():
             self.logger.record(name, mean)
-        if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
-            self.logger.record("train/moved_share", self.replay_buffer.moved_share())
-            for name, value in self.replay_buffer.selection_log().items():
+        if isinstance(buffer, FollowObjectReplayBuffer):
+            self.logger.record("train/moved_share", buffer.moved_share())
+            for name, value in buffer.selection_log().items():
                 self.logger.record(name, value)
 
     def _chunks(self, gradient_steps: int, batch_size: int) -> list[int]:
@@ -428,6 +479,12 @@ class HerDDPG(DDPG):
         else:
             most = max(1, _DEVICE_CHUNK // batch_size)
             most = -(-gradient_steps // max(1, -(-gradient_steps // most)))
+        if self.overlap:  # one a step, over the first half of the rollout
+            assert isinstance(self.train_freq, TrainFreq)
+            n_steps = self.train_freq.frequency
+            if self.train_freq.unit == TrainFrequencyUnit.EPISODE:
+                n_steps *= self._horizon()
+            most = min(most, -(-gradient_steps // max(1, n_steps // 2)))
         return [min(most, gradient_steps - first) for first in range(0, gradient_steps, most)]
 
     def _sample(self, n: int, n_batches: int = 1) -> tuple[DictReplayBufferSamples, th.Tensor]:
