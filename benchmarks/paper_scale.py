@@ -34,6 +34,7 @@ from sb3_follow_object.object_stage import ObjectStage
 from sb3_follow_object.run_callbacks import CheckpointCallback
 
 TRAINING_STEPS, UPDATES, BATCH = 9_500_000, 200_000, 4_864
+COMMAND = shlex.join(["python", "benchmarks/paper_scale.py", *sys.argv[1:]])
 
 OBJECT = "object's policy", "object's paths and F_phi"
 PARTS: list[tuple[str, type, str]] = [
@@ -129,7 +130,7 @@ def main() -> None:
         config,
         arguments.run,
         resume=(arguments.run / "config.json").exists(),
-        command=shlex.join(["python", *sys.argv]),
+        command=COMMAND,
     )
     wall = time.perf_counter() - started
     clock.seconds["all else, the final test in it"] = wall - sum(clock.seconds.values())
@@ -147,7 +148,7 @@ def main() -> None:
         "batch_size": config.settings["algorithm"]["batch_size"],
         "seconds": round(wall, 1),
         "seconds_of_parts": {name: round(value, 1) for name, value in clock.seconds.items()},
-        "command": shlex.join(["python", *sys.argv]),
+        "command": COMMAND,
         "machine": {
             "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
             "cores": os.cpu_count(),

@@ -3,26 +3,10 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch as th
 from stable_baselines3.td3.policies import Actor
-
-
-@dataclass
-class Phase:
-    """Gradient steps between two rollouts.
-
-    Attributes:
-        batch_size: transitions of a step.
-        chunks: steps whose batches are drawn together, in turn.
-        told: of the chunks that are done, what `Updates.run` returned.
-    """
-
-    batch_size: int
-    chunks: list[int]
-    told: list[th.Tensor] = field(default_factory=list)
 
 
 class EarlierActor:

@@ -22,20 +22,15 @@ from stable_baselines3.common.type_aliases import (
     TrainFrequencyUnit,
 )
 
-from .acting import EarlierActor, Phase
-from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
+from .acting import EarlierActor
+from .auxiliary import AuxiliaryCritic, make_auxiliary, resolve_auxiliary
 from .device_replay import DeviceReplay
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .policies import HerPolicy
-from .tensors import matmul_at
 from .updates import COLUMNS, Updates
 
 SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 
-# Transitions drawn from the buffer in one call: enough to spread the fixed cost, small in memory.
-_SAMPLE_CHUNK = 32_768
-# On the learner's device, where memory is plenty and equal chunks replay one graph.
-_DEVICE_CHUNK = 262_144
 # Floor of the standard deviations, so that entries that hardly vary are not blown up.
 _MIN_STD = 0.01
 _PRECISIONS = ("highest", "high", "medium")
@@ -185,8 +180,7 @@ class HerDDPG(DDPG):
         self.replay_on_device = replay_on_device
         self.overlap = overlap
         self.earlier: EarlierActor | None = None
-        self._phase: Phase | None = None  # gradient steps that are being taken
-        self._means: th.Tensor | None = None  # of the last phase, yet to be logged
+        self._means: th.Tensor | None = None  # of the last updates, yet to be logged
         if _init_setup_model:
             self._setup_model()
 
@@ -242,6 +236,12 @@ class HerDDPG(DDPG):
             warnings.warn(f"Replay stays on the host: {error}.", stacklevel=2)
             return None
 
+    def rollout_steps(self) -> int:
+        """Steps that each environment takes between two calls of `train`."""
+        assert isinstance(self.train_freq, TrainFreq)
+        n = self.train_freq.frequency
+        return n if self.train_freq.unit == TrainFrequencyUnit.STEP else n * self._horizon()
+
     def _horizon(self) -> int:
         """Steps of an episode, from the environment's spec."""
         assert self.env is not None
@@ -265,8 +265,7 @@ class HerDDPG(DDPG):
             scaled = self.rng.uniform(-1.0, 1.0, size=(n_envs, *self.action_space.shape))
         else:
             if self.earlier is not None:
-                if self._phase is not None:
-                    self._go_on(self._phase)
+                self._updates.go_on()
                 action = self.earlier.act(self._last_obs)  # type: ignore[arg-type]
             else:
                 action, _ = self.actor.predict(self._last_obs, deterministic=True)
@@ -303,7 +302,7 @@ class HerDDPG(DDPG):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        names = ("auxiliary_critic", "_updates", "_device_replay", "earlier", "_phase", "_means")
+        names = ("auxiliary_critic", "_updates", "_device_replay", "earlier", "_means")
         return [*super()._excluded_save_params(), *names]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -420,7 +419,7 @@ class HerDDPG(DDPG):
         if self._device_replay is not None:
             assert isinstance(self.replay_buffer, FollowObjectReplayBuffer)
             self._device_replay.refresh(self.replay_buffer)
-        self._phase = Phase(batch_size, self._chunks(gradient_steps, batch_size))
+        self._updates.begin(gradient_steps, batch_size)
         if self.earlier is not None:
             self.earlier.follow(self.actor)
         else:
@@ -428,36 +427,13 @@ class HerDDPG(DDPG):
 
     def finish_updates(self) -> None:
         """Take the gradient steps that `train` has begun and left to the next rollout, if any."""
-        while self._phase is not None:
-            self._go_on(self._phase)
+        self._updates.finish()
 
-    def _go_on(self, phase: Phase) -> None:
-        """Take the next chunk's gradient steps; the last one's end the phase."""
-        n = phase.chunks[len(phase.told)]
-        with matmul_at(self.matmul_precision):
-            data, steps_to_goal = self._sample(n * phase.batch_size, n)
-            bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
-            # All networks share their input moments, so features are computed once.
-            chunk = Transitions(
-                data.observations,
-                data.actions,
-                data.next_observations,
-                self.actor.features_extractor(data.observations),
-                self.actor.features_extractor(data.next_observations),
-            )
-            phase.told.append(
-                self._updates.run(chunk, data.rewards, data.dones, bounds, phase.batch_size)
-            )
-        if len(phase.told) < len(phase.chunks):
-            return
-        self._phase = None
+    def end_updates(self, means: th.Tensor | None, gradient_steps: int) -> None:
+        """Average the actor and log the means of what `COLUMNS` names, after so many steps."""
         # A plain mean until there are enough updates for the share to be left.
-        n = sum(phase.chunks)
-        decay = min(self.average_decay**n, 1.0 - n / self._n_updates)
+        decay = min(self.average_decay**gradient_steps, 1.0 - gradient_steps / self._n_updates)
         self.policy.update_average(decay if self.average_decay > 0.0 else 0.0)
-        self._log(th.cat(phase.told).mean(dim=0))
-
-    def _log(self, means: th.Tensor | None) -> None:
         if self.overlap:  # reading them would wait for the updates; those before have ended
             means, self._means = self._means, means
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -472,22 +448,12 @@ class HerDDPG(DDPG):
             for name, value in buffer.selection_log().items():
                 self.logger.record(name, value)
 
-    def _chunks(self, gradient_steps: int, batch_size: int) -> list[int]:
-        """Gradient steps whose batches are drawn in one call, in turn."""
-        if self._device_replay is None:
-            most = max(1, _SAMPLE_CHUNK // batch_size)
-        else:
-            most = max(1, _DEVICE_CHUNK // batch_size)
-            most = -(-gradient_steps // max(1, -(-gradient_steps // most)))
-        if self.overlap:  # one a step, over the first half of the rollout
-            assert isinstance(self.train_freq, TrainFreq)
-            n_steps = self.train_freq.frequency
-            if self.train_freq.unit == TrainFrequencyUnit.EPISODE:
-                n_steps *= self._horizon()
-            most = min(most, -(-gradient_steps // max(1, n_steps // 2)))
-        return [min(most, gradient_steps - first) for first in range(0, gradient_steps, most)]
+    @property
+    def replays_on_device(self) -> bool:
+        """Whether batches are drawn on the learner's device."""
+        return self._device_replay is not None
 
-    def _sample(self, n: int, n_batches: int = 1) -> tuple[DictReplayBufferSamples, th.Tensor]:
+    def sample(self, n: int, n_batches: int = 1) -> tuple[DictReplayBufferSamples, th.Tensor]:
         """Draw n transitions for so many batches, and (n, 1) steps until each goal was reached."""
         buffer = self.replay_buffer
         assert buffer is not None

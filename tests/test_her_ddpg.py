@@ -89,7 +89,7 @@ def test_targets_are_no_lower_than_the_episode_proves() -> None:
     model = make_model(target_clip=(-10.0, -10.0), learning_rate=3e-3, hindsight_bound=True)
     model.learn(1200, log_interval=None)  # type: ignore[arg-type]
     model.train(600, 64)
-    data, steps = model._sample(500)
+    data, steps = model.sample(500)
     known = th.isfinite(steps)
     bound = (0.9**steps - 1.0) / (1.0 - 0.9)
     with th.no_grad():
