@@ -173,7 +173,10 @@ class Comparison:
     def _cross_job(self, cell: Cell) -> Job | None:
         other = partner(cell.task)
         name = f"{cell.name} on {other}"
-        if other is None or other in read_cross_tests(cell.folder):
+        if other is None:
+            return None
+        kept = read_cross_tests(cell.folder).get(other)
+        if kept is not None and kept["episodes"] >= cell.config.n_final_episodes:
             return None
         if self._failures.get(name, 0) >= ATTEMPTS or not (cell.folder / POLICY).exists():
             return None

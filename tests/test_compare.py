@@ -72,7 +72,7 @@ def do_it(job: Job) -> list[Message]:
         (folder / POLICY).write_text("")
         finish(folder)
     else:
-        tested = {job.other.split("/")[1][:-3]: {"success_rate": 0.5, "episodes": 8}}
+        tested = {job.other.split("/")[1][:-3]: {"success_rate": 0.5, "episodes": 380}}
         (folder / CROSS_TESTS).write_text(json.dumps(tested))
     figures = {"env_steps": 500, "success_rate": 0.5, "k_max": None}
     told: list[Message] = [{"say": "hello"}]
@@ -214,6 +214,11 @@ def test_versions_of_pnp_simple_are_tested_on_each_other(tmp_path: Path) -> None
         "PnPSimpleV1-her-0 on PnPSimpleV2": "FollowObject/PnPSimpleV2-v0",
         "PnPSimpleV2-her-0 on PnPSimpleV1": "FollowObject/PnPSimpleV1-v0",
     }
+    short = {"PnPSimpleV2": {"success_rate": 1.0, "episodes": 4}}  # by a user, with `evaluate`
+    (tmp_path / "PnPSimpleV1-her-0" / CROSS_TESTS).write_text(json.dumps(short))
+    executor = FakeExecutor(do_it)
+    assert comparison(tmp_path, executor, cells)[0].run() == []
+    assert [job.name for job in executor.jobs] == ["PnPSimpleV1-her-0 on PnPSimpleV2"]
 
 
 @pytest.mark.parametrize(
