@@ -22,12 +22,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import torch as th
 
 from sb3_follow_object.callbacks import CurriculumCallback, OriginalGoalEvalCallback
 from sb3_follow_object.config import run_config
 from sb3_follow_object.envs.batch import BatchedSimulation
-from sb3_follow_object.experiment import train
+from sb3_follow_object.experiment import CONFIG, RESULT, train
 from sb3_follow_object.files import atomic_write
 from sb3_follow_object.her_ddpg import HerDDPG
 from sb3_follow_object.object_stage import ObjectStage
@@ -36,24 +37,26 @@ from sb3_follow_object.run_callbacks import CheckpointCallback
 TRAINING_STEPS, UPDATES, BATCH = 9_500_000, 200_000, 4_864
 COMMAND = shlex.join(["python", "benchmarks/paper_scale.py", *sys.argv[1:]])
 
+UPDATES_OF_ROBOT = "robot's updates"
 OBJECT = "object's policy", "object's paths and F_phi"
 PARTS: list[tuple[str, type, str]] = [
     (OBJECT[0], ObjectStage, "learn_policy"),
     (OBJECT[1], ObjectStage, "learn_predictor"),
     ("robot's rollouts besides physics", HerDDPG, "collect_rollouts"),
     ("robot's physics", BatchedSimulation, "step"),
-    ("robot's updates", HerDDPG, "train"),
+    (UPDATES_OF_ROBOT, HerDDPG, "train"),
     ("tests of the curriculum", CurriculumCallback, "_test"),
     ("validations", OriginalGoalEvalCallback, "_on_rollout_end"),
-    ("checkpoints", CheckpointCallback, "_on_rollout_end"),
+    ("checkpoints", CheckpointCallback, "_write"),
 ]
 WHOLE = ("tests of the curriculum", "validations", OBJECT[0])  # with the physics in them
 
 
 class Clock:
-    """Seconds in each part, those of parts inside it left out."""
+    """Seconds in each part, those of parts inside it left out; and the robot's updates so far."""
 
     def __init__(self) -> None:
+        self.updates = 0
         self.seconds = {name: 0.0 for name, _, _ in PARTS}
         self._open: list[tuple[str, float]] = []  # parts, and the seconds of those inside
         for name, owner, method in PARTS:
@@ -70,6 +73,8 @@ class Clock:
             try:
                 return method(*args, **kwargs)
             finally:
+                if name == UPDATES_OF_ROBOT:
+                    self.updates = args[0]._n_updates
                 spent = time.perf_counter() - started
                 self.seconds[name] += spent - self._open.pop()[1]
                 if self._open:
@@ -77,20 +82,6 @@ class Clock:
                     self._open[-1] = outer, inside + spent
 
         return call
-
-
-class Counts:
-    """Follows the robot's training."""
-
-    def __init__(self) -> None:
-        self.updates = 0
-        train_method = HerDDPG.train
-
-        def counted(model: HerDDPG, gradient_steps: int, batch_size: int = 100) -> None:
-            train_method(model, gradient_steps, batch_size)
-            self.updates = model._n_updates
-
-        HerDDPG.train = counted  # type: ignore[method-assign]
 
 
 def main() -> None:
@@ -101,19 +92,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file for the seconds")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--n-envs", type=int, default=304)
-    parser.add_argument("--horizon", type=int, default=50, help="steps of the task's episodes")
     parser.add_argument("--training-steps", type=int, default=TRAINING_STEPS)
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     arguments = parser.parse_args()
 
-    cycle = arguments.n_envs * arguments.horizon
+    horizon = gym.spec(arguments.env).max_episode_steps
+    assert horizon is not None
+    cycle = arguments.n_envs * horizon
     n_cycles = -(-arguments.training_steps // cycle)
     updates = round(UPDATES * arguments.training_steps / TRAINING_STEPS)
     overrides: dict[str, Any] = {
         "n_envs": arguments.n_envs,
         "batch_size": BATCH,
         "gradient_steps": -(-updates // n_cycles),
-        "overlap": True,
         "test_every": 8,
         "eval_every": 500_000,
         "checkpoint_minutes": 5.0,
@@ -124,12 +115,14 @@ def main() -> None:
     # The object's steps and the tests' are counted too: they come on top.
     overrides.setdefault("n_timesteps", round(1.08 * arguments.training_steps))
     config = run_config(arguments.env, seed=arguments.seed, overrides=overrides)
-    clock, counts = Clock(), Counts()
+    if (arguments.run / RESULT).exists():
+        parser.error(f"{arguments.run} is finished: there is nothing to time")
+    clock = Clock()
     started = time.perf_counter()
     result = train(
         config,
         arguments.run,
-        resume=(arguments.run / "config.json").exists(),
+        resume=(arguments.run / CONFIG).exists(),
         command=COMMAND,
     )
     wall = time.perf_counter() - started
@@ -144,7 +137,7 @@ def main() -> None:
         "object_steps": result["object_steps"],
         "test_steps": result["test_steps"],
         "training_steps": steps,
-        "updates": counts.updates,
+        "updates": clock.updates,
         "batch_size": config.settings["algorithm"]["batch_size"],
         "seconds": round(wall, 1),
         "seconds_of_parts": {name: round(value, 1) for name, value in clock.seconds.items()},

@@ -256,7 +256,7 @@ def _learner(model: Any, batch: int, n: int) -> Measure:
 
 def _learners(device: str, n_stored: int) -> dict[str, Any]:
     """Stock DDPG + HER, the default preset, and that in float32, with so much in their replay."""
-    env = make_vec(ROBOT, 16 if device == "cpu" else 80, 1)
+    env = make_vec(ROBOT, 4 if device == "cpu" else 80, 1)
     entry = read_yaml(preset_file("her"))[ROBOT]
     kwargs = {
         key: value
@@ -273,10 +273,11 @@ def _learners(device: str, n_stored: int) -> dict[str, Any]:
         ),
     }
     for model in models.values():
-        model.learn(800, log_interval=None)
+        model.learn(8_000, log_interval=None)
     for name in ("stock", "default"):
-        _fill(models[name].replay_buffer, env, n_stored // env.num_envs - 50)
-    models["float32"].replay_buffer = models["default"].replay_buffer
+        _fill(models[name].replay_buffer, env, (n_stored - 8_000) // env.num_envs)
+    if n_stored > 8_000:
+        models["float32"].replay_buffer = models["default"].replay_buffer
     return models
 
 
@@ -367,6 +368,8 @@ def main() -> None:
     parser.add_argument("--only", choices=[*parts, "gpu"], help="one part")
     parser.add_argument("--out", type=Path, help="file for the figures of one part")
     arguments = parser.parse_args()
+    if arguments.out is not None and not arguments.only:
+        parser.error("--out is for one part, with --only; all parts go to benchmarks/speed.json")
     chosen = [arguments.only] if arguments.only else list(parts)
     device = "cuda" if arguments.only == "gpu" else "cpu"
 

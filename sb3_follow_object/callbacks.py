@@ -352,10 +352,7 @@ def noise_free(model: BaseAlgorithm, learning: bool = False) -> Policy:
         model: any algorithm of SB3.
         learning: of a HerDDPG that averages its actor, the actor that learns instead.
     """
-    player: Any = model
-    if learning and isinstance(model, HerDDPG):
-        model.finish_updates()
-        player = model.actor
+    player = model.actor if learning and isinstance(model, HerDDPG) else model
     normaliser = model.get_vec_normalize_env()
 
     def policy(obs: Observation) -> np.ndarray:

@@ -91,13 +91,14 @@ class GoalPredictor:
         epochs: int = 30,
         test_share: float = 0.3,
         seed: int = 0,
+        device: str = "auto",
         progress: Progress | None = None,
     ) -> GoalPredictor:
         """Fit F_phi to paths of the object policy by mean squared error (paper, equation 3).
 
         Whole paths are held out, so ``error_mm`` says how well unseen starts and goals are met.
-        Done on a GPU where PyTorch sees one. The result depends on ``seed`` and the processor
-        alone, and no global random state is touched.
+        The result depends on ``seed`` and the device's kind alone and no global random state is
+        touched.
 
         Args:
             paths: object positions o_1..o_{T+1} of n episodes, shape (n, T+1, 3), metres.
@@ -111,6 +112,7 @@ class GoalPredictor:
             epochs: passes over the training samples, >= 1.
             test_share: share of the paths that is held out, in (0, 1).
             seed: of the split, the weights and the order of the samples.
+            device: of PyTorch that the fit is done on; "auto" is a GPU where there is one.
             progress: called after each epoch with its number from 1 and its mean loss, the
                 squared error per coordinate in units of the paths' variance.
 
@@ -136,11 +138,11 @@ class GoalPredictor:
         _initialise(network, generator)
         x = (torch.from_numpy(inputs) - tensors["input_mean"]) / tensors["input_std"]
         y = (torch.from_numpy(targets) - tensors["output_mean"]) / tensors["output_std"]
-        device = get_device("auto")
+        on = get_device(device)
         _train(
-            network.to(device),
-            x.float().to(device),
-            y.float().to(device),
+            network.to(on),
+            x.float().to(on),
+            y.float().to(on),
             learning_rate=learning_rate,
             batch_size=batch_size,
             epochs=epochs,

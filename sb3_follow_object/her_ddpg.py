@@ -16,21 +16,24 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import (
     DictReplayBufferSamples,
     GymEnv,
-    MaybeCallback,
     Schedule,
     TrainFreq,
     TrainFrequencyUnit,
 )
 
-from .acting import EarlierActor
-from .auxiliary import AuxiliaryCritic, make_auxiliary, resolve_auxiliary
+from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
 from .device_replay import DeviceReplay
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .policies import HerPolicy
+from .tensors import matmul_at
 from .updates import COLUMNS, Updates
 
 SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 
+# Transitions drawn from the buffer in one call: enough to spread the fixed cost, small in memory.
+_SAMPLE_CHUNK = 32_768
+# The same on the learner's device, where memory is plenty and a chunk is a graph.
+_DEVICE_CHUNK = 262_144
 # Floor of the standard deviations, so that entries that hardly vary are not blown up.
 _MIN_STD = 0.01
 _PRECISIONS = ("highest", "high", "medium")
@@ -80,8 +83,6 @@ class HerDDPG(DDPG):
             and reward there, so that no batch is copied. None: on CUDA, where the buffer's settings
             and the environment's reward allow it (`DeviceReplay`). True: also on the CPU, and an
             error where they do not.
-        overlap: explore with the actor as it was before the updates since the last rollout, which a
-            GPU takes while the CPU simulates. Tests, validations and what is saved have them.
         policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.
 
     The other arguments are DDPG's.
@@ -121,7 +122,6 @@ class HerDDPG(DDPG):
         matmul_precision: str = "highest",
         auxiliary: dict[str, Any] | None = None,
         replay_on_device: bool | None = None,
-        overlap: bool = False,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
@@ -178,9 +178,6 @@ class HerDDPG(DDPG):
         self.auxiliary = auxiliary
         self.auxiliary_critic: AuxiliaryCritic | None = None
         self.replay_on_device = replay_on_device
-        self.overlap = overlap
-        self.earlier: EarlierActor | None = None
-        self._means: th.Tensor | None = None  # of the last updates, yet to be logged
         if _init_setup_model:
             self._setup_model()
 
@@ -210,7 +207,6 @@ class HerDDPG(DDPG):
             # Last, so that what is drawn above does not depend on it.
             rate = self.lr_schedule(1.0)
             self.auxiliary_critic = make_auxiliary(self.auxiliary, self.policy, rate, self.gamma)
-        self.earlier = EarlierActor(self.actor) if self.overlap else None
         self._updates = Updates(self)
         self._device_replay = self._make_device_replay()
         if isinstance(self.train_freq, TrainFreq) and (
@@ -236,12 +232,6 @@ class HerDDPG(DDPG):
             warnings.warn(f"Replay stays on the host: {error}.", stacklevel=2)
             return None
 
-    def rollout_steps(self) -> int:
-        """Steps that each environment takes between two calls of `train`."""
-        assert isinstance(self.train_freq, TrainFreq)
-        n = self.train_freq.frequency
-        return n if self.train_freq.unit == TrainFrequencyUnit.STEP else n * self._horizon()
-
     def _horizon(self) -> int:
         """Steps of an episode, from the environment's spec."""
         assert self.env is not None
@@ -264,11 +254,7 @@ class HerDDPG(DDPG):
         if self.num_timesteps < learning_starts:
             scaled = self.rng.uniform(-1.0, 1.0, size=(n_envs, *self.action_space.shape))
         else:
-            if self.earlier is not None:
-                self._updates.go_on()
-                action = self.earlier.act(self._last_obs)  # type: ignore[arg-type]
-            else:
-                action, _ = self.actor.predict(self._last_obs, deterministic=True)
+            action, _ = self.actor.predict(self._last_obs, deterministic=True)
             scaled = self.policy.scale_action(action)
             noise = (
                 self.rng.normal(0.0, self.noise_std, size=scaled.shape)
@@ -302,55 +288,23 @@ class HerDDPG(DDPG):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        names = ("auxiliary_critic", "_updates", "_device_replay", "earlier", "_means")
+        names = ("auxiliary_critic", "_updates", "_device_replay")
         return [*super()._excluded_save_params(), *names]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        self.finish_updates()
         names, variables = super()._get_torch_save_params()
         if self.auxiliary_critic is not None:
             names.append("auxiliary_critic")
             names += [f"auxiliary_critic.{name}" for name in self.auxiliary_critic.optimizers]
-        if self.earlier is not None:
-            names.append("earlier.actor")
         return names, variables
-
-    def learn(
-        self: SelfHerDDPG,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "DDPG",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfHerDDPG:
-        """Learn as SB3's DDPG does."""
-        super().learn(
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-        )
-        self.finish_updates()
-        return self
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Return actions as SB3's DDPG does."""
-        self.finish_updates()
-        return super().predict(observation, state, episode_start, deterministic)
 
     def training_state(self) -> dict[str, Any]:
         """Return everything that the next rollout and update depend on, between rollouts.
 
         The environment has its own state, and so has the replay buffer.
         """
-        self.finish_updates()
         return {
             "policy": self.policy.state_dict(),
-            "earlier": None if self.earlier is None else self.earlier.actor.state_dict(),
             "actor_optimizer": self.actor.optimizer.state_dict(),
             "critic_optimizer": self.critic.optimizer.state_dict(),
             "auxiliary": None
@@ -373,9 +327,6 @@ class HerDDPG(DDPG):
     def load_training_state(self, state: dict[str, Any]) -> None:
         """Continue from `training_state` of an algorithm with the same networks."""
         self.policy.load_state_dict(state["policy"])
-        if self.earlier is not None:
-            self.earlier.actor.load_state_dict(state["earlier"])
-            self.earlier.follow(self.earlier.actor)
         self.actor.optimizer.load_state_dict(state["actor_optimizer"])
         self.critic.optimizer.load_state_dict(state["critic_optimizer"])
         if self.auxiliary_critic is not None:
@@ -405,12 +356,12 @@ class HerDDPG(DDPG):
         return float(low), float(high)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Take gradient steps; several batches are drawn from the buffer in one call.
+        """Take gradient steps; several batches are drawn from the buffer in one call."""
+        with matmul_at(self.matmul_precision):
+            self._train(gradient_steps, batch_size)
 
-        With `overlap` they are begun here and go on as the next rollout does.
-        """
+    def _train(self, gradient_steps: int, batch_size: int) -> None:
         assert self.replay_buffer is not None
-        self.finish_updates()
         self.policy.set_training_mode(True)
         auxiliary = self.auxiliary_critic
         optimizers = [self.actor.optimizer, self.critic.optimizer]
@@ -419,41 +370,45 @@ class HerDDPG(DDPG):
         if self._device_replay is not None:
             assert isinstance(self.replay_buffer, FollowObjectReplayBuffer)
             self._device_replay.refresh(self.replay_buffer)
-        self._updates.begin(gradient_steps, batch_size)
-        if self.earlier is not None:
-            self.earlier.follow(self.actor)
-        else:
-            self.finish_updates()
+        told: list[th.Tensor] = []
+        for n in self._chunks(gradient_steps, batch_size):
+            data, steps_to_goal = self._sample(n * batch_size, n)
+            bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
+            # All networks share their input moments, so features are computed once.
+            chunk = Transitions(
+                data.observations,
+                data.actions,
+                data.next_observations,
+                self.actor.features_extractor(data.observations),
+                self.actor.features_extractor(data.next_observations),
+            )
+            told.append(self._updates.run(chunk, data.rewards, data.dones, bounds, batch_size))
 
-    def finish_updates(self) -> None:
-        """Take the gradient steps that `train` has begun and left to the next rollout, if any."""
-        self._updates.finish()
-
-    def end_updates(self, means: th.Tensor | None, gradient_steps: int) -> None:
-        """Average the actor and log the means of what `COLUMNS` names, after so many steps."""
         # A plain mean until there are enough updates for the share to be left.
         decay = min(self.average_decay**gradient_steps, 1.0 - gradient_steps / self._n_updates)
         self.policy.update_average(decay if self.average_decay > 0.0 else 0.0)
-        if self.overlap:  # reading them would wait for the updates; those before have ended
-            means, self._means = self._means, means
+
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if means is not None:
-            for name, value in zip(COLUMNS, means.tolist(), strict=True):
-                self.logger.record(f"train/{name}", value)
-        auxiliary, buffer = self.auxiliary_critic, self.replay_buffer
+        for name, value in zip(COLUMNS, th.cat(told).mean(dim=0).tolist(), strict=True):
+            self.logger.record(f"train/{name}", value)
         for name, mean in (auxiliary.take_log() if auxiliary else {}).items():
             self.logger.record(name, mean)
-        if isinstance(buffer, FollowObjectReplayBuffer):
-            self.logger.record("train/moved_share", buffer.moved_share())
-            for name, value in buffer.selection_log().items():
+        if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
+            self.logger.record("train/moved_share", self.replay_buffer.moved_share())
+            for name, value in self.replay_buffer.selection_log().items():
                 self.logger.record(name, value)
 
-    @property
-    def replays_on_device(self) -> bool:
-        """Whether batches are drawn on the learner's device."""
-        return self._device_replay is not None
+    def _chunks(self, gradient_steps: int, batch_size: int) -> list[int]:
+        """Gradient steps whose batches are drawn in one call, in turn."""
+        most = _SAMPLE_CHUNK // batch_size
+        if self._device_replay is not None:
+            # Whole intervals, where they fit: chunks that move the targets alike share a graph.
+            most = _DEVICE_CHUNK // batch_size
+            most = most - most % self.target_update_interval or most
+        most = max(1, most)
+        return [min(most, gradient_steps - first) for first in range(0, gradient_steps, most)]
 
-    def sample(self, n: int, n_batches: int = 1) -> tuple[DictReplayBufferSamples, th.Tensor]:
+    def _sample(self, n: int, n_batches: int = 1) -> tuple[DictReplayBufferSamples, th.Tensor]:
         """Draw n transitions for so many batches, and (n, 1) steps until each goal was reached."""
         buffer = self.replay_buffer
         assert buffer is not None

@@ -1,41 +1,21 @@
-"""Gradient steps of HerDDPG, many at once, on CUDA as one graph."""
+"""Gradient steps of HerDDPG on batches that were drawn already, on CUDA as one graph."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch as th
 from torch import nn
 
 from .auxiliary import Transitions
-from .tensors import lowest, matmul_at
+from .tensors import lowest
 
 if TYPE_CHECKING:
     from .her_ddpg import HerDDPG
 
 COLUMNS = ("critic_loss", "actor_loss", "q_mean", "reward_mean")  # what is told of each step
-# Transitions drawn from the buffer in one call: enough to spread the fixed cost, small in memory.
-_SAMPLE_CHUNK = 32_768
-# On the learner's device, where memory is plenty and equal chunks replay one graph.
-_DEVICE_CHUNK = 262_144
 _WARM_UP = 3  # calls before a graph is captured: libraries set themselves up in the first ones
 _MAX_GRAPHS = 4  # kept for calls of different sizes
-
-
-@dataclass
-class _Phase:
-    """Gradient steps between two rollouts.
-
-    Attributes:
-        batch_size: transitions of a step.
-        chunks: steps whose batches are drawn together, in turn.
-        told: of the chunks that are done.
-    """
-
-    batch_size: int
-    chunks: list[int]
-    told: list[th.Tensor] = field(default_factory=list)
 
 
 class Updates:
@@ -52,55 +32,10 @@ class Updates:
 
     def __init__(self, model: HerDDPG) -> None:
         self._model = model
-        self._phase: _Phase | None = None
         self._graphs: dict[Any, _Graph] = {}
         self._n_calls = 0
 
-    def begin(self, gradient_steps: int, batch_size: int) -> None:
-        """Plan so many steps; `go_on` and `finish` take them."""
-        self._phase = _Phase(batch_size, self._chunks(gradient_steps, batch_size))
-
-    def finish(self) -> None:
-        """Take all steps that are left."""
-        while self._phase is not None:
-            self.go_on()
-
-    def go_on(self) -> None:
-        """Take the next chunk of steps, if any are left."""
-        model, phase = self._model, self._phase
-        if phase is None:
-            return
-        n = phase.chunks[len(phase.told)]
-        with matmul_at(model.matmul_precision):
-            data, steps_to_goal = model.sample(n * phase.batch_size, n)
-            bounds = (th.pow(model.gamma, steps_to_goal) - 1.0) / (1.0 - model.gamma)
-            # All networks share their input moments, so features are computed once.
-            features = model.actor.features_extractor
-            chunk = Transitions(
-                data.observations,
-                data.actions,
-                data.next_observations,
-                features(data.observations),
-                features(data.next_observations),
-            )
-            phase.told.append(self._run(chunk, data.rewards, data.dones, bounds, phase.batch_size))
-        if len(phase.told) == len(phase.chunks):
-            self._phase = None
-            model.end_updates(th.cat(phase.told).mean(dim=0), sum(phase.chunks))
-
-    def _chunks(self, gradient_steps: int, batch_size: int) -> list[int]:
-        """Steps whose batches are drawn in one call, in turn."""
-        model = self._model
-        if not model.replays_on_device:
-            most = max(1, _SAMPLE_CHUNK // batch_size)
-        else:
-            most = max(1, _DEVICE_CHUNK // batch_size)
-            most = -(-gradient_steps // -(-gradient_steps // most))
-        if model.overlap:  # one a step, over the first half of the rollout
-            most = min(most, -(-gradient_steps // max(1, model.rollout_steps() // 2)))
-        return [min(most, gradient_steps - first) for first in range(0, gradient_steps, most)]
-
-    def _run(
+    def run(
         self,
         chunk: Transitions,
         rewards: th.Tensor,
@@ -221,7 +156,7 @@ class Updates:
         key = self._key(inputs, batch_size)
         if key not in self._graphs:
             if len(self._graphs) == _MAX_GRAPHS:
-                self._graphs.clear()
+                del self._graphs[next(iter(self._graphs))]
             for optimizer in optimizers:
                 optimizer.zero_grad(set_to_none=True)
             self._graphs[key] = _Graph(self, inputs, batch_size)
@@ -231,10 +166,11 @@ class Updates:
         """What a captured graph has built in: sizes, rates, and where its tensors lie."""
         model = self._model
         optimizers = (model.actor.optimizer, model.critic.optimizer)
+        numbers = range(1, len(inputs["rewards"]) // batch_size + 1)
         return (
             len(inputs["rewards"]),
             batch_size,
-            model._n_updates % model.target_update_interval,
+            tuple((model._n_updates + i) % model.target_update_interval == 0 for i in numbers),
             tuple(group["lr"] for optimizer in optimizers for group in optimizer.param_groups),
             tuple(
                 value.data_ptr()

@@ -186,7 +186,8 @@ class ImaginedGoalVecEnv(VecEnvWrapper):
         obs = cast(Observation, self.venv.reset())
         self._draw(np.arange(self.num_envs), obs)
         self.reset_infos = [
-            {**info, **self._facts(i)} for i, info in enumerate(self.venv.reset_infos)
+            {**info, **facts}
+            for info, facts in zip(self.venv.reset_infos, self._facts(), strict=True)
         ]
         return self._relabel(obs)
 
@@ -208,28 +209,20 @@ class ImaginedGoalVecEnv(VecEnvWrapper):
                 self._shown[imagined],
                 [infos[i] for i in imagined],
             )
-        success, original_success = self._ask(
-            self._success_method,
-            np.concatenate([achieved, achieved]),
-            np.concatenate([self._shown, self._original]),
-        ).reshape(2, -1)
-        facts = zip(
-            infos,
-            self._original.copy(),
-            self._level.tolist(),
-            success.astype(bool).tolist(),
-            original_success.astype(bool).tolist(),
-            strict=True,
+        success, original_success = (
+            self._ask(
+                self._success_method,
+                np.concatenate([achieved, achieved]),
+                np.concatenate([self._shown, self._original]),
+            )
+            .astype(bool)
+            .reshape(2, -1)
         )
         infos = [
-            {
-                **info,
-                "original_goal": original,
-                "imagined_level": level,
-                "is_success": reached,
-                "original_success": original_reached,
-            }
-            for info, original, level, reached, original_reached in facts
+            {**info, **facts, "is_success": reached, "original_success": original_reached}
+            for info, facts, reached, original_reached in zip(
+                infos, self._facts(), success.tolist(), original_success.tolist(), strict=True
+            )
         ]
         for i in ended:
             last = infos[i]["terminal_observation"]
@@ -301,8 +294,12 @@ class ImaginedGoalVecEnv(VecEnvWrapper):
     def _relabel(self, obs: Observation) -> Observation:
         return {**obs, "desired_goal": self._shown.copy()}
 
-    def _facts(self, i: int) -> dict[str, Any]:
-        return {"original_goal": self._original[i].copy(), "imagined_level": int(self._level[i])}
+    def _facts(self) -> list[dict[str, Any]]:
+        """What the infos of each copy say of its episode."""
+        return [
+            {"original_goal": goal, "imagined_level": level}
+            for goal, level in zip(self._original.copy(), self._level.tolist(), strict=True)
+        ]
 
 
 def imagination_of(env: VecEnv | None, asker: str) -> tuple[GoalPredictor, Curriculum]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -89,7 +87,7 @@ def test_targets_are_no_lower_than_the_episode_proves() -> None:
     model = make_model(target_clip=(-10.0, -10.0), learning_rate=3e-3, hindsight_bound=True)
     model.learn(1200, log_interval=None)  # type: ignore[arg-type]
     model.train(600, 64)
-    data, steps = model.sample(500)
+    data, steps = model._sample(500)
     known = th.isfinite(steps)
     bound = (0.9**steps - 1.0) / (1.0 - 0.9)
     with th.no_grad():
@@ -276,29 +274,3 @@ def test_environment_without_goals_is_refused() -> None:
 def test_bad_arguments(arguments: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         make_model(**arguments)
-
-
-def test_overlap_explores_with_the_actor_before_the_last_updates() -> None:
-    model = make_model(overlap=True, noise_std=0.0, random_action_prob=0.0)
-    plain = make_model()
-    model.learn(400, log_interval=None)  # type: ignore[arg-type]
-    assert model.earlier is not None and plain.earlier is None
-    assert model._last_obs is not None
-    before = copy.deepcopy(model.actor)
-    model.train(10, 64)
-    explored, _ = model._sample_action(0, n_envs=4)
-    assert explored == pytest.approx(before.predict(model._last_obs, deterministic=True)[0])
-    newest, _ = model.predict(model._last_obs, deterministic=True)  # type: ignore[arg-type]
-    assert np.abs(explored - newest).max() > 1e-3
-
-
-def test_overlap_learns_and_survives_sb3s_saving(tmp_path: Path) -> None:
-    model = make_model(overlap=True, policy_kwargs={"net_arch": [64, 64]})
-    model.learn(4000, log_interval=None)  # type: ignore[arg-type]
-    assert success_rate(model) > 0.9
-    model.save(tmp_path / "model")
-    loaded = HerDDPG.load(tmp_path / "model", env=model.env)
-    obs: Any = model._last_obs
-    assert loaded.earlier is not None and model.earlier is not None
-    assert (loaded.earlier.act(obs) == model.earlier.act(obs)).all()
-    assert (loaded.earlier.act(obs) != loaded.predict(obs, deterministic=True)[0]).any()
