@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,35 @@ class DistanceReward:
             "replay on the device can compute rewards of 0 within a distance and -1 beyond, or "
             "minus the distance; this environment's compute_reward gives others"
         )
+
+
+def device_replay_of(
+    buffer: Any, device: th.device, wanted: bool | None, normalised: bool
+) -> DeviceReplay | None:
+    """Return a copy of a replay buffer on the learner's device, if it is wanted and possible.
+
+    Args:
+        buffer: of the algorithm.
+        device: of the learner.
+        wanted: None, on CUDA only and where it is possible; True, else an error.
+        normalised: whether the environment is wrapped in VecNormalize.
+
+    Raises:
+        ValueError: it is wanted and not possible.
+    """
+    if wanted is False or (wanted is None and device.type != "cuda"):
+        return None
+    try:
+        if not isinstance(buffer, FollowObjectReplayBuffer):
+            raise ValueError("replay on the device needs a FollowObjectReplayBuffer")
+        if normalised:
+            raise ValueError("replay on the device has no VecNormalize; HerDDPG needs none")
+        return DeviceReplay(buffer, device, np.random.randint(2**31))
+    except ValueError as error:
+        if wanted:
+            raise
+        warnings.warn(f"Replay stays on the host: {error}.", stacklevel=3)
+        return None
 
 
 class DeviceReplay:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -22,7 +21,7 @@ from stable_baselines3.common.type_aliases import (
 )
 
 from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
-from .device_replay import DeviceReplay
+from .device_replay import device_replay_of
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .policies import HerPolicy
 from .tensors import matmul_at
@@ -208,29 +207,17 @@ class HerDDPG(DDPG):
             rate = self.lr_schedule(1.0)
             self.auxiliary_critic = make_auxiliary(self.auxiliary, self.policy, rate, self.gamma)
         self._updates = Updates(self)
-        self._device_replay = self._make_device_replay()
+        self._device_replay = device_replay_of(
+            self.replay_buffer,
+            self.device,
+            self.replay_on_device,
+            self._vec_normalize_env is not None,
+        )
         if isinstance(self.train_freq, TrainFreq) and (
             self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1
         ):
             steps = self.train_freq.frequency * self._horizon()
             self.train_freq = TrainFreq(steps, TrainFrequencyUnit.STEP)
-
-    def _make_device_replay(self) -> DeviceReplay | None:
-        """Return the copy of the replay buffer on the device, if it is wanted and possible."""
-        wanted = self.replay_on_device
-        if wanted is False or (wanted is None and self.device.type != "cuda"):
-            return None
-        try:
-            if not isinstance(self.replay_buffer, FollowObjectReplayBuffer):
-                raise ValueError("replay on the device needs a FollowObjectReplayBuffer")
-            if self._vec_normalize_env is not None:
-                raise ValueError("replay on the device has no VecNormalize; HerDDPG needs none")
-            return DeviceReplay(self.replay_buffer, self.device, np.random.randint(2**31))
-        except ValueError as error:
-            if wanted:
-                raise
-            warnings.warn(f"Replay stays on the host: {error}.", stacklevel=2)
-            return None
 
     def _horizon(self) -> int:
         """Steps of an episode, from the environment's spec."""
