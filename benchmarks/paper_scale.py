@@ -26,7 +26,7 @@ import gymnasium as gym
 import torch as th
 
 from sb3_follow_object.callbacks import CurriculumCallback, OriginalGoalEvalCallback
-from sb3_follow_object.config import run_config
+from sb3_follow_object.config import parse_override, run_config
 from sb3_follow_object.envs.batch import BatchedSimulation
 from sb3_follow_object.experiment import CONFIG, RESULT, train
 from sb3_follow_object.files import atomic_write
@@ -105,13 +105,12 @@ def main() -> None:
         "n_envs": arguments.n_envs,
         "batch_size": BATCH,
         "gradient_steps": -(-updates // n_cycles),
+        "torch_threads": os.cpu_count(),  # F_phi imagines the goals of all copies at once
         "test_every": 8,
         "eval_every": 500_000,
         "checkpoint_minutes": 5.0,
     }
-    for setting in arguments.set:
-        name, _, value = setting.partition("=")
-        overrides[name] = json.loads(value)
+    overrides |= dict(parse_override(setting) for setting in arguments.set)
     # The object's steps and the tests' are counted too: they come on top.
     overrides.setdefault("n_timesteps", round(1.08 * arguments.training_steps))
     config = run_config(arguments.env, seed=arguments.seed, overrides=overrides)

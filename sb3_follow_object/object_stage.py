@@ -165,7 +165,7 @@ class ObjectStage:
             object_on_table=self._on_table(),
             seed=stream_seed(self.seed, "predictor"),
             progress=lambda epoch, loss: between_epochs(),
-            **{"device": model.device.type, **settings["predictor_fit"]},
+            **{"device": str(model.device), **settings["predictor_fit"]},
         )
         self.report(f"  held-out error {float(np.mean(self.predictor.error_mm)):.1f} mm")
         return self.predictor

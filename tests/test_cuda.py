@@ -1,6 +1,6 @@
 """What only a GPU can show: graphs take the steps that Python takes, replay lies by the learner.
 
-Skipped where PyTorch sees no CUDA device. Where it sees one the other tests learn there too.
+Skipped where PyTorch sees no CUDA device. The other tests are meant for the CPU.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sb3_follow_object.her_ddpg import HerDDPG
 from sb3_follow_object.policies import load_actor, save_actor
 from sb3_follow_object.updates import Updates
 
-from .test_device_replay import weights
+from .test_device_replay import assert_resumes_exactly, weights
 from .test_her_ddpg import make_model, success_rate
 from .test_her_replay_buffer import fill, make_buffer, make_env
 from .toy import paths
@@ -82,18 +82,8 @@ def test_same_seed_same_weights() -> None:
 
 
 def test_resumed_training_equals_uninterrupted() -> None:
-    model = trained()
-    other = trained(80, seed=1)
-    other.load_training_state(copy.deepcopy(model.training_state()))
-    other.replay_buffer.load_state_dict(  # type: ignore[union-attr]
-        copy.deepcopy(model.replay_buffer.state_dict())  # type: ignore[union-attr]
-    )
-    for _ in range(6):
-        fill([model.replay_buffer, other.replay_buffer], make_env(4), 15)
-        for each in (model, other):
-            each.train(5, 64)
-    assert model._updates._graphs and other._updates._graphs
-    assert th.equal(weights(model), weights(other))
+    for model in assert_resumes_exactly(6, device=CUDA):
+        assert model._updates._graphs
 
 
 def test_a_learning_rate_that_changes_reaches_the_graph() -> None:

@@ -142,21 +142,26 @@ def test_same_batch_same_weights_as_on_the_host(monkeypatch: pytest.MonkeyPatch)
     assert th.equal(weights(host), weights(device))
 
 
-def test_resumed_training_equals_uninterrupted() -> None:
-    model = make_model(replay_on_device=True)
+def assert_resumes_exactly(n_phases: int, **kwargs: Any) -> tuple[HerDDPG, HerDDPG]:
+    """Train a model and one that took over its state; return both."""
+    model, other = make_model(**kwargs), make_model(seed=1, **kwargs)
     model.learn(400, log_interval=None)  # type: ignore[arg-type]
-    other = make_model(replay_on_device=True, seed=1)
     other.learn(80, log_interval=None)  # type: ignore[arg-type]
     assert not th.equal(weights(model), weights(other))
     other.load_training_state(copy.deepcopy(model.training_state()))
     other.replay_buffer.load_state_dict(  # type: ignore[union-attr]
         copy.deepcopy(model.replay_buffer.state_dict())  # type: ignore[union-attr]
     )
-    for _ in range(2):
+    for _ in range(n_phases):
         fill([model.replay_buffer, other.replay_buffer], make_env(4), 15)
         for each in (model, other):
             each.train(5, 64)
     assert th.equal(weights(model), weights(other))
+    return model, other
+
+
+def test_resumed_training_equals_uninterrupted() -> None:
+    assert_resumes_exactly(2, replay_on_device=True)
 
 
 def test_works_with_an_auxiliary_reward_and_after_sb3s_saving(tmp_path: Any) -> None:
