@@ -105,7 +105,7 @@ def main() -> None:
         "n_envs": arguments.n_envs,
         "batch_size": BATCH,
         "gradient_steps": -(-updates // n_cycles),
-        "torch_threads": os.cpu_count(),  # F_phi imagines the goals of all copies at once
+        "torch_threads": 1,  # what is large is done on the GPU; the cores simulate
         "test_every": 8,
         "eval_every": 500_000,
         "checkpoint_minutes": 5.0,

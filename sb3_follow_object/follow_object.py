@@ -239,6 +239,8 @@ class FollowObject:
             networks = {"object_networks": stage.networks}
             arguments["auxiliary"] = {**arguments["auxiliary"], **networks}
         self.model = HerDDPG(env=self.env, seed=stream_seed(self.seed, "networks"), **arguments)
+        if self.imagine and self.predictor is not None:
+            self.predictor.to(self.model.device)  # it imagines the goals of all copies at once
         # SB3 seeds the environment too; a run's streams are its own.
         self.env.seed(stream_seed(self.seed, "robot"))
         return self.model

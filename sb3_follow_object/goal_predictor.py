@@ -48,6 +48,7 @@ class GoalPredictor:
         physics: short hash of the physics that it was made for.
         object_on_table: whether the object was kept on the table; None where that is not known.
         error_mm: mean distance to the held-out paths for each k in 1..T, shape (T,), millimetres.
+        device: that it imagines on, the CPU unless `to` says another.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class GoalPredictor:
         self.physics = physics
         self.object_on_table = object_on_table
         self.error_mm = error_mm
+        self.device = torch.device("cpu")
         self._tensors = tensors
         self._network = _network(self.hidden)
         self._network.load_state_dict(
@@ -165,6 +167,12 @@ class GoalPredictor:
         predictor.error_mm = 1000.0 * distance.mean(axis=0)
         return predictor
 
+    def to(self, device: torch.device | str) -> GoalPredictor:
+        """Imagine on this device from now on; what `save` writes stays the same."""
+        self.device = torch.device(device)
+        self._network.to(self.device)
+        return self
+
     def predict(self, start: np.ndarray, goal: np.ndarray, k: np.ndarray) -> np.ndarray:
         """Return the imagined position at time-step k + 1, F_phi(o_1, g, k).
 
@@ -193,7 +201,8 @@ class GoalPredictor:
         inputs = np.concatenate([start, goal, k[:, None]], axis=1, dtype=np.float64)
         scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
         with torch.inference_mode():
-            outputs = self._network(torch.from_numpy(scaled.astype(np.float32))).numpy()
+            on = torch.from_numpy(scaled.astype(np.float32)).to(self.device)
+            outputs = self._network(on).cpu().numpy()
         return outputs * self._scales["output_std"] + self._scales["output_mean"]
 
     def paths(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:

@@ -9,10 +9,13 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 
 from sb3_follow_object.device_replay import DeviceReplay
+from sb3_follow_object.envs import physics_id
+from sb3_follow_object.follow_object import FollowObject
 from sb3_follow_object.goal_predictor import GoalPredictor
 from sb3_follow_object.her_ddpg import HerDDPG
 from sb3_follow_object.policies import load_actor, save_actor
@@ -145,6 +148,30 @@ def test_f_phi_fitted_there_imagines_what_one_fitted_here_does(
         assert predictor.error_mm.mean() < 10.0
     distance = there.paths(ways[:, 0], goals) - here.paths(ways[:, 0], goals)
     assert 0.0 < abs(distance).max() < 0.03
+
+
+def test_f_phi_imagines_there_what_it_does_here(tmp_path: Path) -> None:
+    ways, goals = paths(64)
+    predictor = GoalPredictor.fit(ways, goals, env_id="Point-v0", physics="none", epochs=2)
+    here = predictor.paths(ways[:, 0], goals)
+    there = predictor.to(CUDA).paths(ways[:, 0], goals)
+    assert abs(there - here).max() < 1e-4
+    predictor.save(tmp_path)
+    again = GoalPredictor.load(tmp_path)
+    assert again.device.type == "cpu"
+    assert (again.paths(ways[:, 0], goals) == here).all()
+
+
+def test_a_run_imagines_where_it_learns() -> None:
+    task = "FollowObject/PnPShelf-v0"
+    ways = np.random.default_rng(0).uniform(size=(8, 51, 3))
+    facts = {"env_id": task, "physics": physics_id(task)}
+    predictor = GoalPredictor.fit(ways, ways[:, -1], epochs=1, **facts)
+    run = FollowObject(task, n_envs=2, n_threads=1, predictor=predictor, algorithm={"device": CUDA})
+    model = run.prepare()
+    assert predictor.device == model.device
+    assert np.isfinite(run.env.reset()["desired_goal"]).all()  # type: ignore[call-overload]
+    run.close()
 
 
 def test_an_actor_saved_there_plays_on_the_cpu(tmp_path: Path) -> None:
