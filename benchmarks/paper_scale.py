@@ -25,9 +25,10 @@ from typing import Any
 import gymnasium as gym
 import torch as th
 
-from sb3_follow_object.callbacks import CurriculumCallback, OriginalGoalEvalCallback
+from sb3_follow_object.callbacks import CurriculumCallback
 from sb3_follow_object.config import parse_override, run_config
 from sb3_follow_object.envs.batch import BatchedSimulation
+from sb3_follow_object.eval_callback import OriginalGoalEvalCallback
 from sb3_follow_object.experiment import CONFIG, RESULT, train
 from sb3_follow_object.files import atomic_write
 from sb3_follow_object.her_ddpg import HerDDPG

@@ -18,6 +18,13 @@ STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 MAX_DISPLACEMENT = 0.05  # metres a step at action 1
 
 
+def cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 class BatchedSimulation:
     """N copies of a scene, moved through the mocap body that the scene's one weld pulls.
 
@@ -28,7 +35,7 @@ class BatchedSimulation:
     Args:
         scene: what to simulate.
         n_envs: number of copies, at least 1.
-        n_threads: threads that step them; None takes one a processor, but no more than copies.
+        n_threads: threads that step them; None takes one a core, but no more than copies.
 
     Raises:
         ValueError: `n_envs` or `n_threads` is below 1.
@@ -44,7 +51,7 @@ class BatchedSimulation:
             raise ValueError(f"n_threads must be at least 1 or None, not {n_threads}.")
         self.scene = scene
         self.n_envs = n_envs
-        self.n_threads = min(n_threads or os.cpu_count() or 1, n_envs)
+        self.n_threads = min(n_threads or cores(), n_envs)
         self._pool = ThreadPoolExecutor(self.n_threads - 1) if self.n_threads > 1 else None
         model = scene.model
         self.dt = model.opt.timestep * N_SUBSTEPS
@@ -158,6 +165,7 @@ class BatchedSimulation:
             "goals": self.goals.copy(),
             "steps": self.steps.copy(),
             "faults": list(self.faults),
+            "task": repr(self.scene.task),
             **read,
         }
 
@@ -165,8 +173,11 @@ class BatchedSimulation:
         """Go on from what `get_state` gave.
 
         Raises:
-            ValueError: it comes from another number of copies or another scene.
+            ValueError: it comes from another number of copies or another task.
         """
+        task = repr(self.scene.task)
+        if state.get("task", task) != task:  # the first checkpoints do not say it
+            raise ValueError(f"The state is not of {self.scene.task.name} but of {state['task']}.")
         size = mujoco.mj_stateSize(self.scene.model, STATE)
         if state["physics"].shape != (self.n_envs, size):
             raise ValueError(

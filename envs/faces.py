@@ -141,14 +141,16 @@ class SingleEnv(_GoalFace, gym.Env):
         return {
             "arguments": self._arguments,
             "simulation": self.simulation.get_state(),
-            "np_random": self._np_random,
+            "np_random": (self._np_random, self._np_random_seed),
+            "reward_type": self.reward_type,
             "spec": self.spec,
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state["arguments"])  # type: ignore[misc]
         self.simulation.set_state(state["simulation"])
-        self._np_random = state["np_random"]
+        self._np_random, self._np_random_seed = state["np_random"]
+        self.reward_type = state["reward_type"]
         self.spec = state["spec"]
 
 
@@ -171,6 +173,7 @@ class BatchVecEnv(_GoalFace, VecEnv):
         simulation = self.simulation_type(scene, n_envs, n_threads)
         self._start(simulation, reward_type, render_mode, show_regions)
         super().__init__(n_envs, *_spaces(simulation))
+        self.metadata = METADATA  # the line above has left out the frames a second
         self.horizon = scene.task.horizon
         self._generators = [seeding.np_random()[0] for _ in range(n_envs)]
         self._actions = np.zeros((n_envs, simulation.action_size))
@@ -181,8 +184,8 @@ class BatchVecEnv(_GoalFace, VecEnv):
     def spec(self) -> EnvSpec:
         """Gymnasium's spec of each copy, which says how long its episodes are."""
         scene = self.simulation.scene
-        name = f"{scene.task.name}{'Object' if scene.alone else ''}"
-        return EnvSpec(f"FollowObject/{name}-v0", max_episode_steps=scene.task.horizon)
+        env_id = f"FollowObject/{scene.task.name}{'Object' if scene.alone else ''}-v0"
+        return gym.registry.get(env_id) or EnvSpec(env_id, max_episode_steps=scene.task.horizon)
 
     def reset(self) -> dict[str, np.ndarray]:
         """Start an episode in every copy; seeds set by `seed()` count from here."""
@@ -272,7 +275,13 @@ class BatchVecEnv(_GoalFace, VecEnv):
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute, which all copies share."""
+        """Set an attribute, which all copies share.
+
+        Raises:
+            ValueError: it is asked for some copies only.
+        """
+        if len(set(self._get_indices(indices))) < self.num_envs:
+            raise ValueError(f"all copies share {attr_name!r}; set it without indices.")
         setattr(self, attr_name, value)
 
     def env_method(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
@@ -102,14 +103,24 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
     Raises:
         ValueError: the id is unknown, an option is wrong or `n_envs` is below 1.
     """
-    name = env_id.rpartition(":")[2]  # a module before it has been imported, or gymnasium does it
+    module, _, name = env_id.rpartition(":")
+    if module and name not in IDS:
+        try:
+            import_module(module)
+        except ImportError as error:
+            raise ValueError(
+                f"{env_id!r} names a module that cannot be imported ({error})."
+            ) from error
     if name in IDS:
         # Late, because the classes need the ids above.
         from .fetch import FetchVecEnv
         from .object_locomotion import ObjectVecEnv
 
         face = ObjectVecEnv if IDS[name][1] else FetchVecEnv
-        return face(name, n_envs, n_threads, **options)
+        try:
+            return face(name, n_envs, n_threads, **options)
+        except TypeError as error:
+            raise ValueError(f"{env_id!r} cannot be made: {error}") from error
 
     from stable_baselines3.common.vec_env import DummyVecEnv
 

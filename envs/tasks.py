@@ -39,7 +39,7 @@ class Region:
     """A rectangle over the table, given as (x, y) offsets from a reference point.
 
     Raises:
-        ValueError: an unknown reference, or a lower bound above the upper one.
+        ValueError: an unknown reference, bounds that are not pairs, or a lower above an upper one.
     """
 
     reference: Literal["gripper", "table"]
@@ -51,17 +51,29 @@ class Region:
             raise ValueError(
                 f"A region's reference is 'gripper' or 'table', not {self.reference!r}."
             )
+        if not len(self.low) == len(self.high) == 2:
+            raise ValueError(f"A region's bounds are (x, y) each, not {self.low} and {self.high}.")
         if not all(low <= high for low, high in zip(self.low, self.high, strict=True)):
             raise ValueError(f"A region from {self.low} to {self.high} is empty.")
 
 
 @dataclass(frozen=True)
 class Height:
-    """How far a goal lies above a resting object: U(low, high) with this chance, else 0."""
+    """How far a goal lies above a resting object: U(low, high) with this chance, else 0.
+
+    Raises:
+        ValueError: not 0 <= low <= high in metres, or a chance outside [0, 1].
+    """
 
     low: float = 0.0
     high: float = 0.0
     chance: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.low <= self.high < np.inf:
+            raise ValueError(f"A height needs 0 <= low <= high, not {self.low} and {self.high}.")
+        if not 0.0 <= self.chance <= 1.0:
+            raise ValueError(f"A height's chance lies in [0, 1], not at {self.chance}.")
 
 
 @dataclass(frozen=True)
@@ -112,8 +124,10 @@ class Task:
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*", self.name):
             raise ValueError(f"A task's name is made of letters and digits, not {self.name!r}.")
-        if self.horizon < 1:
-            raise ValueError(f"The horizon of {self.name} is {self.horizon}; it must be >= 1.")
+        if type(self.horizon) is not int or self.horizon < 1:
+            raise ValueError(
+                f"The horizon of {self.name} is {self.horizon!r}; it must be a whole number >= 1."
+            )
         try:
             hash(self)  # scenes are kept by their tasks
         except TypeError as error:

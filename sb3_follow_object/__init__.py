@@ -16,8 +16,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .auxiliary import AuxiliaryReward as AuxiliaryReward
     from .callbacks import CurriculumCallback as CurriculumCallback
-    from .callbacks import OriginalGoalEvalCallback as OriginalGoalEvalCallback
     from .curriculum import Curriculum as Curriculum
+    from .eval_callback import OriginalGoalEvalCallback as OriginalGoalEvalCallback
     from .follow_object import FollowObject as FollowObject
     from .goal_predictor import GoalPredictor as GoalPredictor
     from .her_ddpg import HerDDPG as HerDDPG
@@ -37,7 +37,7 @@ _HOME = {
     "ImaginedGoalVecEnv": "wrappers",
     "ImaginedGoalWrapper": "wrappers",
     "ObjectNetworks": "object_networks",
-    "OriginalGoalEvalCallback": "callbacks",
+    "OriginalGoalEvalCallback": "eval_callback",
 }
 
 __all__ = [*_HOME, "register_envs"]

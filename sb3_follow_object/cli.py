@@ -356,8 +356,9 @@ def _plot(args: argparse.Namespace) -> None:
 
 
 def _compare(args: argparse.Namespace) -> None:
-    from .compare import Comparison, cores, share_cores, write_report
+    from .compare import Comparison, share_cores, write_report
     from .config import parse_override
+    from .envs.batch import cores
     from .executors import Executor, LocalExecutor
     from .files import lock
     from .grid import LOGS, Settings, plan

@@ -21,13 +21,6 @@ from .worker import CROSS, STAGE, TRAIN, Job
 _POLL = 1.0  # seconds
 
 
-def cores() -> int:
-    """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def share_cores(
     n_cores: int, n_runs: int, jobs: int | None, threads: int | None
 ) -> tuple[int, int]:
@@ -109,7 +102,11 @@ class Comparison:
                 raise
         if self._requests:
             raise KeyboardInterrupt
-        return [name for name in self._cells if self._ledger.failed(name)]
+        return [
+            name
+            for name, cell in self._cells.items()
+            if not cell.finished and self._ledger.failed(name)
+        ]
 
     def _listen(self) -> None:
         for name, message in self._executor.messages(_POLL):

@@ -68,16 +68,13 @@ class DistanceReward:
         )
 
 
-def device_replay_of(
-    buffer: Any, device: th.device, wanted: bool | None, normalised: bool
-) -> DeviceReplay | None:
+def device_replay_of(buffer: Any, device: th.device, wanted: bool | None) -> DeviceReplay | None:
     """Return a copy of a replay buffer on the learner's device, if it is wanted and possible.
 
     Args:
         buffer: of the algorithm.
         device: of the learner.
         wanted: None, on CUDA only and where it is possible; True, else an error.
-        normalised: whether the environment is wrapped in VecNormalize.
 
     Raises:
         ValueError: it is wanted and not possible.
@@ -87,8 +84,6 @@ def device_replay_of(
     try:
         if not isinstance(buffer, FollowObjectReplayBuffer):
             raise ValueError("replay on the device needs a FollowObjectReplayBuffer")
-        if normalised:
-            raise ValueError("replay on the device has no VecNormalize; HerDDPG needs none")
         return DeviceReplay(buffer, device, np.random.randint(2**31))
     except ValueError as error:
         if wanted:

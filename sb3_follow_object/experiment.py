@@ -16,11 +16,10 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.vec_env import VecEnv
 
-from .callbacks import OriginalGoalEvalCallback
-from .envs import make_vec, object_id
+from .envs import make_vec
+from .eval_callback import OriginalGoalEvalCallback
 from .files import atomic_write, lock, remove_half_written
 from .follow_object import FollowObject
-from .her_ddpg import HerDDPG
 from .object_policy import StopWhenSolved
 from .object_stage import Report
 from .policies import load_actor
@@ -113,7 +112,7 @@ def train(
             **copy.deepcopy(config.settings),  # SB3 writes into policy_kwargs
         )
         stack.callback(run.close)
-        _check_algorithms(run)
+        run.check()
         if not resume:
             folder.mkdir(parents=True, exist_ok=True)
             stack.enter_context(lock(folder, wait=False))
@@ -309,35 +308,6 @@ def _stopped(error: Exception, run: FollowObject, folder: Path) -> RuntimeError:
         f"training stopped at {run.env_steps} env steps: {reason}; "
         f"the run in {folder} can be resumed {rest}"
     )
-
-
-def _check_algorithms(run: FollowObject) -> None:
-    """Build both algorithms once, in small, so that a wrong argument is not found hours later."""
-    small = {"policy": "MultiInputPolicy", "buffer_size": 10 * run.env.num_envs}
-    settings = run.settings
-    envs = [(run.env, settings["algorithm"], run.imagine)]
-    if run.has_object_stage:
-        object_env = make_vec(object_id(run.env_id), 1)
-        envs.append((object_env, settings["object_algorithm"], False))
-    for env, arguments, imagines in envs:
-        arguments = copy.deepcopy(arguments)
-        replay = dict(arguments.get("replay_buffer_kwargs") or {})
-        if replay.get("copy_info_dict"):
-            raise ValueError("copy_info_dict cannot be set: checkpoints do not hold infos")
-        # What these two need is not there yet; their settings have been checked.
-        if run.object_stage.needs_networks:
-            arguments.pop("auxiliary", None)
-        if imagines:
-            replay["imagined_ratio"] = 0.0
-        try:
-            HerDDPG(env=env, **{**arguments, **small, "replay_buffer_kwargs": replay})
-        except ValueError:
-            raise
-        except Exception as error:  # SB3 and torch raise anything; so do others' environments
-            reason = str(error) or type(error).__name__
-            raise ValueError(f"the algorithm cannot be built: {reason}") from error
-    if run.has_object_stage:
-        object_env.close()
 
 
 def _logger(folder: Path, env_steps: int) -> Logger:

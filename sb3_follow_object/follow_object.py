@@ -16,12 +16,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from .callbacks import CurriculumCallback
 from .checkpoint import load_tree, save_tree
+from .checks import check_algorithms, check_settings
 from .curriculum import Curriculum
 from .envs import IDS, make_vec
 from .files import atomic_write
 from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
-from .keywords import check_keywords, with_tuples
+from .keywords import with_tuples
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
 from .object_stage import ObjectStage, Report
@@ -36,6 +37,7 @@ from .resuming import (
 )
 from .seeds import stream_seed
 from .sldr import reads_object_networks
+from .task_ids import known_id
 from .wrappers import ImaginedGoalVecEnv
 
 
@@ -105,6 +107,7 @@ class FollowObject:
         seed: int = 0,
         report: Report | None = None,
     ):
+        full_id, env_id = env_id, known_id(env_id)
         self.settings: dict[str, Any] = {
             "env_id": env_id,
             "imagine": imagine,
@@ -125,18 +128,9 @@ class FollowObject:
             "store_tests": store_tests,
             "seed": seed,
         }
-        if n_envs < 1:
-            raise ValueError(f"n_envs is {n_envs}; it must be at least 1")
-        for name, given, function in (
-            ("algorithm", algorithm, HerDDPG.__init__),
-            ("curriculum", curriculum, Curriculum.__init__),
-            ("object_algorithm", object_algorithm, HerDDPG.__init__),
-            ("predictor_fit", predictor_fit, GoalPredictor.fit),
-            ("inverse_fit", inverse_fit, ObjectNetworks.check_fit),
-        ):
-            check_keywords(name, given or {}, function)
-        ObjectNetworks.check_fit(**self.settings["inverse_fit"])
+        check_settings(self.settings)
         self.env_id = env_id
+        self.full_id = full_id  # with the module that registers it, as given
         self.imagine = imagine
         self.seed = seed
         self.report = report or (lambda sentence: None)
@@ -146,6 +140,7 @@ class FollowObject:
         self.env: VecEnv = self._robot_env("robot")
         self.horizon = int(self.env.get_attr("spec", indices=[0])[0].max_episode_steps)
         self.curriculum = Curriculum(self.horizon, **self.settings["curriculum"])
+        self._checked = False
         self.model: HerDDPG | None = None
         self.curriculum_callback: CurriculumCallback | None = None
         if predictor is not None:
@@ -215,10 +210,17 @@ class FollowObject:
         """Env steps of the curriculum's tests, part of `env_steps`."""
         return self.curriculum_callback.test_steps if self.curriculum_callback else 0
 
+    def check(self) -> None:
+        """Raise a ValueError for a setting that a later stage would fail on."""
+        if not self._checked:
+            check_algorithms(self.settings, self.env, self.object_stage.needs_networks)
+            self._checked = True
+
     def prepare(self) -> HerDDPG:
         """Run the stages that are missing before the robot can train; build its algorithm."""
         if self.model is not None:
             return self.model
+        self.check()
         if self.imagine:
             predictor = self.predictor or self.object_stage.learn_predictor()
             test_env = self._robot_env("test")
@@ -346,7 +348,8 @@ class FollowObject:
             ValueError: a setting is a Python object, which a save does not hold.
         """
         try:
-            settings = json.dumps(self.settings, indent=2).encode()
+            saved = {**self.settings, "env_id": self.full_id}
+            settings = json.dumps(saved, indent=2).encode()
         except TypeError as error:
             raise ValueError(f"these settings cannot be saved: {error}") from error
         folder = Path(folder)
@@ -372,12 +375,13 @@ class FollowObject:
         folder = Path(folder)
         try:
             settings = with_tuples(json.loads((folder / "settings.json").read_text()))
+            env_id = known_id(settings["env_id"])
             predictor = None
             if (folder / "predictor").exists():
-                predictor = GoalPredictor.load(folder / "predictor", env_id=settings["env_id"])
+                predictor = GoalPredictor.load(folder / "predictor", env_id=env_id)
             networks = None
             if (folder / OBJECT_FILE).exists():
-                networks = ObjectNetworks.load(folder / OBJECT_FILE, env_id=settings["env_id"])
+                networks = ObjectNetworks.load(folder / OBJECT_FILE, env_id=env_id)
             run = cls(**settings, predictor=predictor, object_networks=networks, report=report)
             run.load_state_dict(load_tree(folder / "state.safetensors"))
             return run

@@ -122,7 +122,7 @@ class GoalPredictor:
             ValueError: an argument has a wrong shape or range, or holds NaN or infinity.
         """
         paths, goals = _checked_paths(paths, goals)
-        _check_training(hidden, learning_rate, batch_size, epochs, test_share)
+        cls.check_fit(hidden, learning_rate, batch_size, epochs, test_share, device)
         n, horizon = len(paths), paths.shape[1] - 1
         n_test = min(max(round(test_share * n), 1), n - 1)
         generator = torch.Generator().manual_seed(seed)
@@ -166,6 +166,33 @@ class GoalPredictor:
         distance = np.linalg.norm(imagined[:, 1:] - paths[test, 1:], axis=2)
         predictor.error_mm = 1000.0 * distance.mean(axis=0)
         return predictor
+
+    @staticmethod
+    def check_fit(
+        hidden: Sequence[int] = (512, 512, 512),
+        learning_rate: float = 1e-3,
+        batch_size: int = 128,
+        epochs: int = 30,
+        test_share: float = 0.3,
+        device: str = "auto",
+    ) -> None:
+        """Raise a ValueError unless `fit` can do with these arguments."""
+        if not valid_hidden(list(hidden)):
+            raise ValueError(
+                f"hidden must be 1 to {LAYERS_LIMIT} widths in 1..{WIDTH_LIMIT}, got {hidden!r}."
+            )
+        if not 0.0 < learning_rate < np.inf:
+            raise ValueError(f"learning_rate must be > 0 and finite, got {learning_rate!r}.")
+        if batch_size < 1 or epochs < 1:
+            raise ValueError(
+                f"batch_size and epochs must be >= 1, got {batch_size!r} and {epochs!r}."
+            )
+        if not 0.0 < test_share < 1.0:
+            raise ValueError(f"test_share must lie between 0 and 1, got {test_share!r}.")
+        try:
+            get_device(device)
+        except RuntimeError as error:
+            raise ValueError(f"device {device!r} cannot be used: {error}") from error
 
     def to(self, device: torch.device | str) -> GoalPredictor:
         """Imagine on this device from now on; what `save` writes stays the same."""
@@ -358,22 +385,3 @@ def _checked_paths(paths: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np
     if not (np.isfinite(paths).all() and np.isfinite(goals).all()):
         raise ValueError("paths and goals must be finite, got NaN or infinity in them.")
     return paths, goals
-
-
-def _check_training(
-    hidden: Sequence[int],
-    learning_rate: float,
-    batch_size: int,
-    epochs: int,
-    test_share: float,
-) -> None:
-    if not valid_hidden(list(hidden)):
-        raise ValueError(
-            f"hidden must be 1 to {LAYERS_LIMIT} widths in 1..{WIDTH_LIMIT}, got {hidden!r}."
-        )
-    if not 0.0 < learning_rate < np.inf:
-        raise ValueError(f"learning_rate must be > 0 and finite, got {learning_rate!r}.")
-    if batch_size < 1 or epochs < 1:
-        raise ValueError(f"batch_size and epochs must be >= 1, got {batch_size!r} and {epochs!r}.")
-    if not 0.0 < test_share < 1.0:
-        raise ValueError(f"test_share must lie between 0 and 1, got {test_share!r}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -11,7 +12,6 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import (
     DictReplayBufferSamples,
     GymEnv,
@@ -23,7 +23,9 @@ from stable_baselines3.common.type_aliases import (
 from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
 from .device_replay import device_replay_of
 from .her_replay_buffer import FollowObjectReplayBuffer
+from .moments import InputMoments
 from .policies import HerPolicy
+from .ranges import check_value
 from .tensors import matmul_at
 from .updates import COLUMNS, Updates
 
@@ -33,8 +35,6 @@ SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 _SAMPLE_CHUNK = 32_768
 # The same on the learner's device, where memory is plenty and a chunk is a graph.
 _DEVICE_CHUNK = 262_144
-# Floor of the standard deviations, so that entries that hardly vary are not blown up.
-_MIN_STD = 0.01
 _PRECISIONS = ("highest", "high", "medium")
 
 
@@ -54,7 +54,8 @@ class HerDDPG(DDPG):
     - a second reward with a critic of its own may be added: `auxiliary`.
 
     Args:
-        env: with Dict observations "observation", "achieved_goal", "desired_goal".
+        env: with Dict observations "observation", "achieved_goal", "desired_goal", of which the
+            first says where what is to be moved is: the networks read it and the desired goal.
         gamma: in (0, 1); by default 1 - 1/T for episodes of T steps.
         train_freq: in episodes of every environment, or in steps of every environment.
         noise_std: of the Gaussian noise on each action in [-1, 1]; `action_noise` replaces it.
@@ -87,7 +88,8 @@ class HerDDPG(DDPG):
     The other arguments are DDPG's.
 
     Raises:
-        ValueError: for an environment without goals or an argument outside its range.
+        ValueError: for an environment without goals or in VecNormalize, an argument outside its
+            range, or, at the first update, rewards above 0 with `target_clip` "auto".
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": HerPolicy}
@@ -144,6 +146,9 @@ class HerDDPG(DDPG):
             )
         if replay_on_device not in (None, False, True):
             raise ValueError(f"replay_on_device is {replay_on_device!r}; give true, false or none")
+        for name, value in (("gamma", gamma), ("tau", tau), ("batch_size", batch_size)):
+            if value is not None:
+                check_value(name, value, "HerDDPG")
         super().__init__(
             policy,
             env,
@@ -190,28 +195,24 @@ class HerDDPG(DDPG):
             )
         if self.gamma is None:
             self.gamma = 1.0 - 1.0 / self._horizon()
+        if self._vec_normalize_env is not None:
+            raise ValueError(
+                "HerDDPG standardises its inputs itself and knows the range of its rewards; leave "
+                "VecNormalize (rl_zoo3's normalize) out"
+            )
         if self.auxiliary is not None:
-            if self._vec_normalize_env is not None:
-                raise ValueError(
-                    "auxiliary rewards read raw observations; leave VecNormalize (rl_zoo3's "
-                    "normalize) out: HerDDPG standardises its inputs itself"
-                )
             self.auxiliary = resolve_auxiliary(self.auxiliary, self.env)
         super()._setup_model()
         self.rng = np.random.default_rng(np.random.randint(2**31))
         if not hasattr(self, "moments"):  # SB3's load() brings them before it comes here
-            self.moments = RunningMeanStd(shape=(self.actor.features_dim,))
-        self._moments_pos = 0
+            self.moments = InputMoments(self.actor.features_dim)
         if self.auxiliary is not None:
             # Last, so that what is drawn above does not depend on it.
             rate = self.lr_schedule(1.0)
             self.auxiliary_critic = make_auxiliary(self.auxiliary, self.policy, rate, self.gamma)
         self._updates = Updates(self)
         self._device_replay = device_replay_of(
-            self.replay_buffer,
-            self.device,
-            self.replay_on_device,
-            self._vec_normalize_env is not None,
+            self.replay_buffer, self.device, self.replay_on_device
         )
         if isinstance(self.train_freq, TrainFreq) and (
             self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1
@@ -255,24 +256,22 @@ class HerDDPG(DDPG):
         return self.policy.unscale_action(scaled), scaled
 
     def _update_moments(self) -> None:
-        """Take in what was stored since the last call; goals count as shown and as achieved."""
-        buffer = self.replay_buffer
-        assert buffer is not None
-        rows = np.arange(
-            self._moments_pos, buffer.pos + (buffer.pos < self._moments_pos) * buffer.buffer_size
-        )
-        self._moments_pos = buffer.pos
-        if len(rows) == 0:
-            return
-        rows %= buffer.buffer_size
-        obs = buffer.observations["observation"][rows].reshape(len(rows) * self.n_envs, -1)
-        for key in ("desired_goal", "achieved_goal"):
-            goals = buffer.next_observations[key][rows].reshape(len(obs), -1)
-            self.moments.update(np.concatenate([obs, goals], axis=1).astype(np.float64))
-        self.policy.set_moments(
-            th.as_tensor(self.moments.mean, dtype=th.float32),
-            th.as_tensor(np.sqrt(self.moments.var).clip(min=_MIN_STD), dtype=th.float32),
-        )
+        """Standardise inputs from now on by all that has been stored."""
+        assert self.replay_buffer is not None
+        if self.moments.take(self.replay_buffer):
+            self.policy.set_moments(
+                th.as_tensor(self.moments.mean, dtype=th.float32),
+                th.as_tensor(self.moments.std, dtype=th.float32),
+            )
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        """Load a replay buffer as SB3 does.
+
+        Where the model has moments of its inputs already, they are those of what it loads.
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+        assert self.replay_buffer is not None
+        self.moments.buffer_was_loaded(self.replay_buffer)
 
     def _excluded_save_params(self) -> list[str]:
         names = ("auxiliary_critic", "_updates", "_device_replay")
@@ -297,12 +296,7 @@ class HerDDPG(DDPG):
             "auxiliary": None
             if self.auxiliary_critic is None
             else self.auxiliary_critic.training_state(),
-            "moments": {
-                "mean": self.moments.mean,
-                "var": self.moments.var,
-                "count": float(self.moments.count),
-                "pos": self._moments_pos,
-            },
+            "moments": self.moments.state_dict(),
             "rng": self.rng.bit_generator.state,
             "device_rng": None
             if self._device_replay is None
@@ -318,9 +312,8 @@ class HerDDPG(DDPG):
         self.critic.optimizer.load_state_dict(state["critic_optimizer"])
         if self.auxiliary_critic is not None:
             self.auxiliary_critic.load_training_state(state["auxiliary"])
-        moments = state["moments"]
-        self.moments.mean, self.moments.var = moments["mean"].copy(), moments["var"].copy()
-        self.moments.count, self._moments_pos = moments["count"], moments["pos"]
+        assert self.replay_buffer is not None
+        self.moments.load_state_dict(state["moments"], self.replay_buffer)
         self.rng.bit_generator.state = state["rng"]
         if self._device_replay is not None and state["device_rng"] is not None:
             self._device_replay.generator.set_state(state["device_rng"])
@@ -331,7 +324,8 @@ class HerDDPG(DDPG):
 
     def expect_new_replay(self) -> None:
         """Take in for the moments what is stored from now on: the replay buffer begins anew."""
-        self._moments_pos = 0
+        assert self.replay_buffer is not None
+        self.moments.begin_anew(self.replay_buffer)
 
     def _target_bounds(self) -> tuple[float, float]:
         if self.target_clip == "auto":
@@ -354,12 +348,12 @@ class HerDDPG(DDPG):
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         self._update_learning_rate(optimizers + ([auxiliary.optimizer] if auxiliary else []))
         self._update_moments()
-        if self._device_replay is not None:
-            assert isinstance(self.replay_buffer, FollowObjectReplayBuffer)
-            self._device_replay.refresh(self.replay_buffer)
+        self._refresh_device_replay()
         told: list[th.Tensor] = []
         for n in self._chunks(gradient_steps, batch_size):
             data, steps_to_goal = self._sample(n * batch_size, n)
+            if self._n_updates == 0 and self._device_replay is None:
+                self._check_rewards(data.rewards)
             bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
             # All networks share their input moments, so features are computed once.
             chunk = Transitions(
@@ -385,6 +379,27 @@ class HerDDPG(DDPG):
             for name, value in self.replay_buffer.selection_log().items():
                 self.logger.record(name, value)
 
+    def _refresh_device_replay(self) -> None:
+        """Upload what is new; where that turns out to be impossible, go on on the host."""
+        if self._device_replay is None:
+            return
+        assert isinstance(self.replay_buffer, FollowObjectReplayBuffer)
+        try:
+            self._device_replay.refresh(self.replay_buffer)
+        except ValueError as error:
+            if self.replay_on_device:
+                raise
+            warnings.warn(f"Replay goes on on the host: {error}.", stacklevel=2)
+            self._device_replay = None
+
+    def _check_rewards(self, rewards: th.Tensor) -> None:
+        """Refuse rewards whose returns lie outside the bounds that "auto" stands for."""
+        if self.target_clip == "auto" and float(rewards.max()) > 0.0:
+            raise ValueError(
+                f"a reward is {float(rewards.max()):g}; target_clip 'auto' is for none above "
+                "0: give (low, high), the bounds of the returns, or None"
+            )
+
     def _chunks(self, gradient_steps: int, batch_size: int) -> list[int]:
         """Gradient steps whose batches are drawn in one call, in turn."""
         most = _SAMPLE_CHUNK // batch_size
@@ -402,8 +417,8 @@ class HerDDPG(DDPG):
         if isinstance(buffer, FollowObjectReplayBuffer):
             if self._device_replay is not None:
                 return self._device_replay.sample_with_steps(n)
-            return buffer.sample_with_steps(n, self._vec_normalize_env, n_batches)
-        data = buffer.sample(n, env=self._vec_normalize_env)
+            return buffer.sample_with_steps(n, n_batches=n_batches)
+        data = buffer.sample(n)
         return data, th.full((n, 1), th.inf, device=self.device)
 
     def _trained_parameters(self) -> tuple[list[th.Tensor], list[th.Tensor]]:

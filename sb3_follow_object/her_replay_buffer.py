@@ -122,11 +122,16 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
             check_keywords("cher", cher, GoalSelection.__init__)
         self.selection = None if cher is None else GoalSelection(**cher)
         self.reward_function = reward_function
+        goal_shape = self.observations["desired_goal"].shape
+        if moved_priority == "energy" and goal_shape[-1] < 3:
+            raise ValueError(
+                f"moved_priority 'energy' reads a height in metres from goals of 3 numbers; these "
+                f"have {goal_shape[-1]}: take 'uniform'"
+            )
         if imagined_ratio > 0.0:
             imagination_of(env, IMAGINED_RATIO)  # raises now rather than at the first sample
         self.rng = np.random.default_rng(np.random.randint(2**31) if seed is None else seed)
 
-        goal_shape = self.observations["desired_goal"].shape
         self.original_goals = np.zeros(
             goal_shape if imagined_ratio > 0.0 else (0,), dtype=np.float32
         )
@@ -210,7 +215,13 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         return float(np.clip(gains, 0.0, None).sum())
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the content and the generator, as views that later additions change."""
+        """Return the content and the generator, as views that later additions change.
+
+        Raises:
+            ValueError: with `copy_info_dict`; infos are Python objects.
+        """
+        if self.copy_info_dict:
+            raise ValueError("a replay buffer's state has no infos: leave copy_info_dict out")
         used = self.buffer_size if self.full else self.pos
         return {
             "pos": self.pos,

@@ -48,7 +48,7 @@ class NormalizedGoalExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
         """Map a batch of observations to features (n, features_dim)."""
-        inputs = th.cat([observations[key].float() for key in self.keys], dim=-1)
+        inputs = th.cat([observations[key].float().flatten(1) for key in self.keys], dim=-1)
         return ((inputs - self.mean) / self.std).clamp_(-self.clip, self.clip)
 
 
@@ -92,6 +92,9 @@ class HerPolicy(TD3Policy):
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
+        if kwargs.get("optimizer_class", th.optim.Adam) in (th.optim.Adam, th.optim.AdamW):
+            # One kernel for all parameters: the update is memory-bound otherwise.
+            optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         if "features_extractor_class" in kwargs:
             raise ValueError(
                 "HerPolicy brings its own features extractor; leave features_extractor_class out"
@@ -104,8 +107,7 @@ class HerPolicy(TD3Policy):
             net_arch=[256, 256, 256] if net_arch is None else net_arch,
             features_extractor_class=NormalizedGoalExtractor,
             features_extractor_kwargs={"clip": features_clip},
-            # One kernel for all parameters: the update is memory-bound otherwise.
-            optimizer_kwargs={"fused": True, **(optimizer_kwargs or {})},
+            optimizer_kwargs=optimizer_kwargs,
             **kwargs,
         )
 

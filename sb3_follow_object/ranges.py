@@ -83,3 +83,10 @@ def _check_widths(value: Any, where: str, least: int = 0) -> None:
         raise ValueError(
             f"{where} must be {least} to {_LAYERS} whole numbers in 1..{_WIDTH}, not {value!r}"
         )
+
+
+def check_positive(**values: int) -> None:
+    """Raise a ValueError for a count below 1."""
+    for name, value in values.items():
+        if value < 1:
+            raise ValueError(f"{name} must be >= 1, got {value!r}.")

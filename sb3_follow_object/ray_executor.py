@@ -80,12 +80,13 @@ class RayExecutor:
         Raises:
             ValueError: another process works in its folder.
         """
-        held = self._locks[job.name] = ExitStack()
-        held.enter_context(lock(Path(job.folder), wait=False))
-        # A failure is judged here, where it is written down; Ray must not repeat it by itself.
-        task = self._ray.remote(num_cpus=job.threads, max_retries=0)(_work)
-        reference = task.remote(job.to_json(), _read_files(Path(job.folder)), self._mailbox)
-        self._jobs[reference] = job
+        with ExitStack() as held:
+            held.enter_context(lock(Path(job.folder), wait=False))
+            # A failure is judged here, where it is written down; Ray must not repeat it by itself.
+            task = self._ray.remote(num_cpus=job.threads, max_retries=0)(_work)
+            reference = task.remote(job.to_json(), _read_files(Path(job.folder)), self._mailbox)
+            self._jobs[reference] = job
+            self._locks[job.name] = held.pop_all()
 
     def messages(self, timeout: float) -> list[tuple[str, Message]]:
         """Return what the jobs told, waiting up to `timeout` seconds for one to end."""

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
+
+from .her_ddpg import HerDDPG
 
 Observation = dict[str, np.ndarray]
 Policy = Callable[[Observation], np.ndarray]
@@ -22,13 +25,11 @@ class Episodes:
 
     Attributes:
         success: (n,) bool, `is_success` at the last step of each episode, for the goal shown.
-        original_success: (n,) bool, the same for the task's own goal.
         returns: (n,) float, undiscounted sum of the rewards.
         env_steps: steps simulated, all copies counted, episodes that were not needed included.
     """
 
     success: np.ndarray
-    original_success: np.ndarray
     returns: np.ndarray
     env_steps: int
 
@@ -82,7 +83,7 @@ def run_episodes(
     wanted = np.array([(n_episodes + i) // n_envs for i in range(n_envs)])
     finished = np.zeros(n_envs, dtype=int)
     returns_so_far = np.zeros(n_envs)
-    success, original_success, returns = [], [], []
+    success, returns = [], []
     env_steps = n_diverged = 0
 
     obs = venv.reset()
@@ -109,12 +110,26 @@ def run_episodes(
                         "success rates need an environment that reports it"
                     )
                 success.append(bool(infos[i]["is_success"]))
-                original_success.append(
-                    bool(infos[i].get("original_success", infos[i]["is_success"]))
-                )
                 returns.append(returns_so_far[i])
                 finished[i] += 1
             returns_so_far[i] = 0.0
         obs = new_obs
 
-    return Episodes(np.array(success), np.array(original_success), np.array(returns), env_steps)
+    return Episodes(np.array(success), np.array(returns), env_steps)
+
+
+def noise_free(model: BaseAlgorithm, learning: bool = False) -> Policy:
+    """Return the model's deterministic policy on observations as the environments give them.
+
+    Args:
+        model: any algorithm of SB3.
+        learning: of a HerDDPG that averages its actor, the actor that learns instead.
+    """
+    player = model.actor if learning and isinstance(model, HerDDPG) else model
+    normaliser = model.get_vec_normalize_env()
+
+    def policy(obs: Observation) -> np.ndarray:
+        seen = obs if normaliser is None else normaliser.normalize_obs(obs)
+        return player.predict(seen, deterministic=True)[0]
+
+    return policy

@@ -11,7 +11,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from .callbacks import OriginalGoalEvalCallback
+from .eval_callback import OriginalGoalEvalCallback
 from .follow_object import FollowObject
 from .run_folder import BEST_POLICY, POLICY, Checkpoints
 

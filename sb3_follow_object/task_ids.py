@@ -43,6 +43,16 @@ def check_task(env_id: str) -> str:
     return name
 
 
+def known_id(env_id: str) -> str:
+    """Return an id as the package's tables have it: without a module, if it is one of ours.
+
+    Raises:
+        ValueError: the module that it names cannot be imported.
+    """
+    name = import_task(env_id)
+    return name if name in IDS else env_id
+
+
 def import_task(env_id: str) -> str:
     """Import the module that may register an id and return the id without the module's name.
 

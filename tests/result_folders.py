@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from sb3_follow_object.callbacks import OriginalGoalEvalCallback
+from sb3_follow_object.eval_callback import OriginalGoalEvalCallback
 from sb3_follow_object.experiment import CONFIG, EVALUATIONS, RESULT, RunConfig
 
 

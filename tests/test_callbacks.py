@@ -13,8 +13,9 @@ from stable_baselines3 import DDPG, SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
-from sb3_follow_object.callbacks import CurriculumCallback, OriginalGoalEvalCallback
+from sb3_follow_object.callbacks import CurriculumCallback
 from sb3_follow_object.curriculum import Curriculum
+from sb3_follow_object.eval_callback import OriginalGoalEvalCallback
 from sb3_follow_object.wrappers import ImaginedGoalVecEnv, ImaginedGoalWrapper
 
 from . import toy
@@ -245,6 +246,38 @@ def test_a_test_env_must_show_h_max() -> None:
             CurriculumCallback(env, 1)  # type: ignore[arg-type]
 
 
+def test_a_test_env_must_share_the_curriculum() -> None:
+    callback = CurriculumCallback(imagining(toy.curriculum(), "test"), N)
+    with pytest.raises(ValueError, match="the Curriculum object that the training has"):
+        learner(imagining(toy.curriculum())).learn(10, callback=callback)
+    with pytest.raises(ValueError, match="imagines no goals"):
+        learner(bare()).learn(10, callback=callback)
+
+
+def test_a_loaded_model_goes_on_at_its_k_max_with_a_test_env(tmp_path: Path) -> None:
+    curriculum = toy.curriculum(threshold=0.0, k_max=5)
+    model = learner(imagining(curriculum))
+    model.learn(2 * N * toy.HORIZON, callback=CurriculumCallback(imagining(curriculum, "test"), N))
+    assert curriculum.k_max == 6
+    model.save(tmp_path / "model")
+    begun = toy.curriculum(threshold=1.0, k_max=2)
+    loaded = DDPG.load(tmp_path / "model", env=imagining(begun))
+    loaded.learn(10, callback=CurriculumCallback(imagining(begun, "test"), N))
+    assert begun.k_max == 6
+    assert loaded.curriculum_state["k_max"] == 6
+
+
+def test_learning_again_counts_anew_and_tests_an_episode_of_every_copy(tmp_path: Path) -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    callback = CurriculumCallback(imagining(curriculum, "test"))
+    evaluation = OriginalGoalEvalCallback(bare(), N, 80)
+    model = learner(imagining(curriculum))
+    for n in (1, 2):
+        model.learn(2 * N * toy.HORIZON, callback=[callback, evaluation])
+        assert callback.test_steps == N * toy.HORIZON
+        assert evaluation.n_evaluations == n
+
+
 # Evaluation
 
 
@@ -345,3 +378,8 @@ def test_another_runs_file_is_left_alone(tmp_path: Path) -> None:
 def test_bad_evaluation_settings_are_refused(options: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         OriginalGoalEvalCallback(bare(), **{"n_episodes": 1, "every_steps": 1, **options})
+
+
+def test_an_evaluation_in_vec_normalize_is_refused() -> None:
+    with pytest.raises(ValueError, match="eval_env is in VecNormalize"):
+        OriginalGoalEvalCallback(VecNormalize(bare()), 1, 1)

@@ -6,7 +6,9 @@ import json
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,14 +18,14 @@ from result_folders import finish
 
 from sb3_follow_object import cli
 from sb3_follow_object.compare import Comparison, share_cores
-from sb3_follow_object.config import parse_override
+from sb3_follow_object.config import load_config, parse_override
 from sb3_follow_object.cross import CROSS_TESTS
 from sb3_follow_object.executors import LocalExecutor, Message
-from sb3_follow_object.experiment import OBJECT_STAGE, POLICY, RESULT
+from sb3_follow_object.experiment import OBJECT_STAGE, POLICY, RESULT, train
 from sb3_follow_object.files import lock
 from sb3_follow_object.grid import Cell, Settings, plan, prepare, read_grid
 from sb3_follow_object.grid_display import GridDisplay
-from sb3_follow_object.worker import CROSS, STAGE, TRAIN, Job
+from sb3_follow_object.worker import CROSS, STAGE, TRAIN, Job, run_job
 
 SETTINGS = Settings(steps=1000)
 TINY = ["policy_kwargs.net_arch=[8]", "batch_size=16", "gradient_steps=2", "n_envs=2"]
@@ -335,3 +337,31 @@ def test_real_run_is_stopped_resumed_and_ends(
     with lock(tmp_path, wait=False):
         assert cli.main(words) == 2
     assert f"another process works in {tmp_path}" in capsys.readouterr().err
+
+
+def test_job_waits_for_the_worker_of_a_killed_comparison(tmp_path: Path) -> None:
+    (cell,) = plan(tmp_path, ["PushSideGap"], ["her"], [0], SETTINGS)
+    prepare(cell, None)
+    other = ExitStack()  # that worker: it has not heard yet that its comparison is gone
+    other.enter_context(lock(cell.folder, wait=False))
+    with pytest.raises(ValueError, match="another process works in"):
+        train(load_config(cell.folder), cell.folder, resume=True, report=pytest.fail)
+
+    def end() -> None:
+        finish(cell.folder, env_steps=1000)
+        other.close()
+
+    threading.Timer(0.5, end).start()
+    told: list[dict[str, Any]] = []
+    run_job(Job(TRAIN, cell.name, str(cell.folder)), told.append)
+    assert told == [{"say": f"{cell.folder} is finished already"}], "it looks after it waited"
+
+
+def test_run_finished_after_it_was_given_up_is_no_failure(tmp_path: Path) -> None:
+    (cell,) = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS)
+    runs, _ = comparison(tmp_path, FakeExecutor(do_it), [cell])
+    runs._ledger.note_failure(cell.name, "diverged", final=True)
+    prepare(cell, None)
+    finish(cell.folder)
+    (cell,) = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS)
+    assert comparison(tmp_path, FakeExecutor(do_it), [cell])[0].run() == []

@@ -33,7 +33,5 @@ def test_run_depends_on_its_seed_alone(n_envs: int, tmp_path: Path) -> None:
     assert threaded == first
     other = outcome(tmp_path / "other", seed=1, n_envs=n_envs, n_threads=1)
     assert other["policy.safetensors"] != first["policy.safetensors"]
-
-
-def test_settings_given_are_not_written_into() -> None:
+    # Settings that were given are not written into.
     assert runs.SMALL_NET["policy_kwargs"] == {"net_arch": [8]}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_follow_object.curriculum import Curriculum
 from sb3_follow_object.device_replay import DeviceReplay, DistanceReward
@@ -15,7 +16,7 @@ from sb3_follow_object.envs import make_vec
 from sb3_follow_object.her_ddpg import HerDDPG
 from sb3_follow_object.wrappers import ImaginedGoalVecEnv
 
-from .test_her_ddpg import make_model, success_rate
+from .test_her_ddpg import TINY, make_model, success_rate
 from .test_her_replay_buffer import LazyPointEnv, as_arrays, fill, make_buffer, make_env
 from .toy import HORIZON, PointEnv, StraightPredictor
 
@@ -131,9 +132,9 @@ def test_same_batch_same_weights_as_on_the_host(monkeypatch: pytest.MonkeyPatch)
     device.set_parameters(copy.deepcopy(host.get_parameters()))
     device._n_updates, device.replay_buffer = host._n_updates, host.replay_buffer
     device.set_logger(host.logger)
-    device.moments, device._moments_pos = host.moments, host._moments_pos
+    device.moments = host.moments
     batch = host.replay_buffer.sample_with_steps(128)  # type: ignore[union-attr]
-    monkeypatch.setattr(host.replay_buffer, "sample_with_steps", lambda *_: batch)
+    monkeypatch.setattr(host.replay_buffer, "sample_with_steps", lambda *_, **__: batch)
     monkeypatch.setattr(device._device_replay, "sample_with_steps", lambda _: batch)
     before = weights(device)
     for model in (host, device):
@@ -229,3 +230,24 @@ def test_chunks_of_a_call_move_the_targets_alike() -> None:
     assert model._chunks(3, 10**6) == [1, 1, 1]
     assert make_model(replay_on_device=True)._chunks(120, 256) == [120]
     assert make_model()._chunks(40, 4864) == [6] * 6 + [4]
+
+
+def test_a_goal_that_moves_sends_replay_back_to_the_host() -> None:
+    """Where nobody asked for the device; else it is an error."""
+
+    class MovingGoal(PointEnv):
+        def step(self, action: np.ndarray) -> Any:
+            self.goal = self.goal + 0.01
+            return super().step(action)
+
+    def learner() -> HerDDPG:
+        env = DummyVecEnv([MovingGoal] * 2)
+        return HerDDPG("MultiInputPolicy", env, **TINY, replay_on_device=True, seed=0)
+
+    with pytest.raises(ValueError, match="goals that stay the same"):
+        learner().learn(40)
+    model = learner()
+    model.replay_on_device = None
+    with pytest.warns(UserWarning, match="goes on on the host: .* goals that stay the same"):
+        model.learn(40)
+    assert model._device_replay is None and model._n_updates > 0

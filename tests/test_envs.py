@@ -258,3 +258,46 @@ def test_pictures_show_markers_and_regions(env_id: str) -> None:
     venv.reset()
     assert venv.render().shape == (960, 480, 3)
     venv.close()
+
+
+def test_a_second_reset_starts_other_episodes() -> None:
+    venv = FetchVecEnv("FollowObject/PnPSimpleV1-v0", 2, 1, seed=3)
+    first, second = venv.reset()["desired_goal"], venv.reset()["desired_goal"]
+    assert (first != second).any(axis=1).all()
+    venv.seed(3)
+    np.testing.assert_array_equal(venv.reset()["desired_goal"], first)
+
+
+def test_a_pickled_copy_keeps_its_seed_reward_and_spec() -> None:
+    env = gym.make("FollowObject/PnPShelf-v0").unwrapped
+    env.reset(seed=5)
+    env.reward_type = "dense"
+    twin = pickle.loads(pickle.dumps(env))
+    assert (twin.np_random_seed, twin.reward_type, twin.spec) == (5, "dense", env.spec)
+    np.testing.assert_array_equal(
+        twin.reset()[0]["desired_goal"], env.reset()[0]["desired_goal"], err_msg="next goal"
+    )
+
+
+def test_a_state_of_another_task_is_refused() -> None:
+    one, other = (make_vec(f"FollowObject/{n}-v0", 1, 1) for n in ("PushSideGap", "PushMiddleGap"))
+    one.reset()
+    with pytest.raises(ValueError, match="not of PushMiddleGap but of"):
+        other.set_state(one.get_state())
+
+
+def test_copies_of_a_batch_share_their_attributes_and_can_be_made_again() -> None:
+    venv = make_vec("FollowObject/PnPShelf-v0", 2, 1)
+    with pytest.raises(ValueError, match="all copies share 'reward_type'"):
+        venv.set_attr("reward_type", "dense", indices=[0])
+    venv.set_attr("reward_type", "dense")
+    assert venv.get_attr("reward_type") == ["dense", "dense"]
+    assert venv.metadata["render_fps"] == 25
+    assert gym.make(venv.get_attr("spec")[0]).spec.id == "FollowObject/PnPShelf-v0"
+
+
+def test_wrong_options_and_modules_are_refused_in_a_sentence() -> None:
+    with pytest.raises(ValueError, match=r"cannot be made: .*colour"):
+        make_vec("FollowObject/PnPShelf-v0", 1, colour="red")
+    with pytest.raises(ValueError, match="names a module that cannot be imported"):
+        make_vec("no_such_module:FollowObject/Other-v0", 1)

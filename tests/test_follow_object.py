@@ -265,3 +265,29 @@ def test_preset_learns_what_the_run_folder_learns(method: str, tmp_path: Path) -
 def test_preset_refuses_what_train_refuses() -> None:
     with pytest.raises(ValueError, match="did you mean 'batch_size'"):
         FollowObject.from_preset(ENV, overrides={"batchsize": 3})
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"algorithm": {"noise_std": -1.0}}, "noise_std"),
+        ({"algorithm": {"replay_buffer_kwargs": {"moved_rato": 0.5}}}, "moved_rato"),
+        ({"algorithm": {"seed": 1}}, "algorithm has no setting 'seed'"),
+        ({"object_algorithm": {"policy": "MlpPolicy"}}, "object_algorithm has no setting 'policy'"),
+        ({"object_algorithm": {"tau": 2.0}}, "tau is 2.0"),
+        ({"curriculum": {"horizon": 5}}, "curriculum has no setting 'horizon'"),
+        ({"predictor_fit": {"seed": 1}}, "predictor_fit has no setting 'seed'"),
+        ({"predictor_fit": {"test_share": 2.0}}, "test_share must lie between"),
+        ({"n_test_episodes": 0}, "n_test_episodes is 0"),
+        ({"n_paths": 1}, "n_paths is 1"),
+    ],
+)
+def test_wrong_settings_are_refused_before_the_object_learns(
+    settings: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        FollowObject(ENV, **{**TINY, **settings}, report=pytest.fail).learn(2000)  # type: ignore
+
+
+def test_an_id_may_name_its_module() -> None:
+    assert FollowObject(f"sb3_follow_object:{ENV}", **TINY).env_id == ENV

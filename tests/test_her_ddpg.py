@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_follow_object.envs import make_vec
 from sb3_follow_object.her_ddpg import HerDDPG
@@ -95,16 +95,22 @@ def test_targets_are_no_lower_than_the_episode_proves() -> None:
     assert float((q - bound)[known].abs().mean()) < 2.0 < float(q[known].mean() + 10.0)
 
 
-def test_matmul_precision_is_that_of_the_update_alone() -> None:
+@pytest.mark.parametrize("precision", ["highest", "medium"])
+def test_matmul_precision_is_that_of_the_update_alone(
+    precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = th.get_float32_matmul_precision()
-    q_values = []
-    for precision in ("highest", "medium"):
-        model = make_model(matmul_precision=precision)
-        model.learn(400, log_interval=None)  # type: ignore[arg-type]
-        assert th.get_float32_matmul_precision() == before
-        data = make_model().env.reset()  # type: ignore[union-attr]
-        q_values.append(model.predict(data, deterministic=True)[0])
-    np.testing.assert_allclose(q_values[0], q_values[1], atol=0.5)
+    model = make_model(matmul_precision=precision)
+    train, seen = model._train, []
+
+    def note(*arguments: Any) -> None:
+        seen.append(th.get_float32_matmul_precision())
+        train(*arguments)
+
+    monkeypatch.setattr(model, "_train", note)
+    model.learn(100, log_interval=None)  # type: ignore[arg-type]
+    assert th.get_float32_matmul_precision() == before
+    assert set(seen) == {precision}
 
 
 def test_predict_uses_the_averaged_actor_and_exploration_the_live_one() -> None:
@@ -164,7 +170,7 @@ def test_inputs_are_standardised_by_what_is_stored() -> None:
     assert features.max() == 5.0
 
 
-def test_exploration_mixes_uniform_actions_and_noise() -> None:
+def test_exploration_mixes_uniform_actions_in() -> None:
     model = make_model(n_envs=100, random_action_prob=1.0, noise_std=0.0)
     model._setup_learn(1000)
     actions = np.concatenate([model._sample_action(0, None, 100)[1] for _ in range(20)])
@@ -173,6 +179,16 @@ def test_exploration_mixes_uniform_actions_and_noise() -> None:
     quiet._setup_learn(1000)
     wanted = quiet.predict(quiet._last_obs, deterministic=True)[0]  # type: ignore[arg-type]
     np.testing.assert_allclose(quiet._sample_action(0, None, 1)[1], wanted, rtol=1e-6)
+
+
+def test_exploration_adds_noise_of_the_given_size() -> None:
+    model = make_model(n_envs=100, random_action_prob=0.0, noise_std=0.1)
+    model._setup_learn(1000)
+    wanted = model.actor.predict(model._last_obs, deterministic=True)[0]  # type: ignore[arg-type]
+    noise = np.concatenate([model._sample_action(0, None, 100)[1] - wanted for _ in range(20)])
+    inside = np.tile(np.abs(wanted) < 0.5, (20, 1))  # not clipped
+    assert noise[inside].std() == pytest.approx(0.1, rel=0.1)
+    assert abs(noise[inside].mean()) < 0.01
 
 
 def test_target_networks_move_once_an_interval() -> None:
@@ -217,6 +233,34 @@ def test_sb3_saves_and_loads_it(tmp_path: Any) -> None:
         loaded.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
     )
     loaded.learn(80, log_interval=None)  # type: ignore[arg-type]
+
+
+def test_moments_of_a_loaded_buffer_are_counted_once(tmp_path: Any) -> None:
+    model = make_model()
+    model.learn(400, log_interval=None)  # type: ignore[arg-type]
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    count = float(model.moments.count)
+    # The model that it is of, that model loaded, and a longer one: none sees the content anew.
+    loaded = HerDDPG.load(tmp_path / "model", env=model.env)
+    longer = make_model()
+    longer.learn(800, log_interval=None)  # type: ignore[arg-type]
+    for other, before in ((model, count), (loaded, count), (longer, float(longer.moments.count))):
+        other.load_replay_buffer(tmp_path / "buffer")
+        other._update_moments()
+        assert other.moments.count == before
+    fresh = make_model()
+    fresh.load_replay_buffer(tmp_path / "buffer")
+    fresh._update_moments()
+    np.testing.assert_allclose(fresh.moments.mean, model.moments.mean, atol=1e-6)
+    assert fresh.moments.count == pytest.approx(count)
+
+
+def test_moments_take_in_a_buffer_as_long_as_a_rollout() -> None:
+    model = make_model(buffer_size=4 * HORIZON)  # of every environment
+    model.learn(4 * HORIZON * 3, log_interval=None)  # type: ignore[arg-type]
+    # Each step is two samples: the goal shown and the one achieved.
+    assert model.moments.count == pytest.approx(2 * 4 * HORIZON * 3, rel=1e-3)
 
 
 def test_actor_file_needs_no_training_code(tmp_path: Any) -> None:
@@ -269,8 +313,50 @@ def test_environment_without_goals_is_refused() -> None:
         ({"target_clip": "wide"}, "target_clip is 'wide'"),
         ({"target_clip": [0.0, -1.0]}, "give .low, high."),
         ({"target_clip": [0.0]}, "give .low, high."),
+        ({"gamma": 1.0}, "gamma is 1.0; it must lie in"),
+        ({"tau": 2.0}, "tau is 2.0; it must lie in"),
+        ({"batch_size": 0}, "batch_size is 0; it must be at least 1"),
     ],
 )
 def test_bad_arguments(arguments: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         make_model(**arguments)
+
+
+def test_vec_normalize_is_refused() -> None:
+    """It would standardise twice."""
+    with pytest.raises(ValueError, match="leave VecNormalize"):
+        HerDDPG("MultiInputPolicy", VecNormalize(DummyVecEnv([PointEnv])), **TINY)
+
+
+class Paid(PointEnv):
+    """Rewards of 0 and 1."""
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> np.ndarray:
+        return super().compute_reward(achieved, desired, info) + 1.0
+
+
+def test_rewards_above_the_bounds_of_targets_are_refused() -> None:
+    env = DummyVecEnv([Paid] * 4)
+    with pytest.raises(ValueError, match="a reward is 1; target_clip 'auto' is for none above 0"):
+        HerDDPG("MultiInputPolicy", env, **TINY).learn(100)
+    HerDDPG("MultiInputPolicy", env, **TINY, target_clip=(0.0, 10.0)).learn(100)
+
+
+def test_other_optimisers_and_observations_of_more_dimensions() -> None:
+    class Square(PointEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            entries = dict(self.observation_space.spaces)  # type: ignore[attr-defined]
+            entries["observation"] = gym.spaces.Box(-np.inf, np.inf, (3, 1))
+            self.observation_space = gym.spaces.Dict(entries)
+
+        def _observe(self) -> dict[str, np.ndarray]:
+            obs = super()._observe()
+            return {**obs, "observation": obs["observation"].reshape(3, 1).astype(np.float32)}
+
+    policy_kwargs = {"net_arch": [8], "optimizer_class": th.optim.RMSprop}
+    env = DummyVecEnv([Square] * 2)
+    model = HerDDPG("MultiInputPolicy", env, **{**TINY, "policy_kwargs": policy_kwargs})
+    model.learn(100, log_interval=None)  # type: ignore[arg-type]
+    assert isinstance(model.actor.optimizer, th.optim.RMSprop)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -251,3 +252,23 @@ def test_works_in_stock_ddpg(tmp_path: Any) -> None:
     model.save_replay_buffer(tmp_path / "buffer")
     model.load_replay_buffer(tmp_path / "buffer")
     model.learn(10 * HORIZON, reset_num_timesteps=False)
+
+
+def test_a_state_without_its_infos_is_not_given() -> None:
+    buffer = make_buffer(make_env(), copy_info_dict=True)
+    with pytest.raises(ValueError, match="leave copy_info_dict out"):
+        buffer.state_dict()
+
+
+def test_energy_needs_a_height() -> None:
+    class Flat(PointEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            box = spaces.Box(-np.inf, np.inf, (2,))
+            keys = ("achieved_goal", "desired_goal")
+            entries = {**self.observation_space.spaces, **dict.fromkeys(keys, box)}  # type: ignore
+            self.observation_space = spaces.Dict(entries)
+
+    env = DummyVecEnv([Flat])
+    with pytest.raises(ValueError, match="goals of 3 numbers; these have 2"):
+        make_buffer(env, moved_priority="energy")

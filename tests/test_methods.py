@@ -13,6 +13,7 @@ from sb3_follow_object.config import run_config
 from sb3_follow_object.experiment import OBJECT_STAGE, RunConfig, claim, train
 from sb3_follow_object.grid import needs_object_stage, stage_settings
 from sb3_follow_object.object_networks import FILE, ObjectNetworks
+from sb3_follow_object.run_folder import checkpoint_files
 
 TASK = "FollowObject/PushSideGap-v0"
 ROBOT_STEPS = 800
@@ -126,8 +127,11 @@ def test_sldr_counts_of_a_shared_object_stage_what_it_uses(tmp_path: Path) -> No
     """The comparison copies a whole stage, with F_phi, into the folders of the runs."""
     config = tiny_run("sldr")
     alone = train(config, tmp_path / "alone", report=quiet)
-    both = replace(config, settings={**config.settings, "imagine": True})
-    train(both, tmp_path / "stage", report=quiet, object_stage_only=True)
+    both = replace(config, settings={**config.settings, "imagine": True}, keep_last_checkpoint=True)
+    told: list[str] = []
+    train(both, tmp_path / "stage", report=told.append, object_stage_only=True)
+    assert any(said.startswith("checkpoint at 400") for said in told)
+    assert not checkpoint_files(tmp_path / "stage"), "no run goes on from a shared stage's"
     claim(tmp_path / "shared", config)
     for name in ("predictor", FILE, OBJECT_STAGE):
         (tmp_path / "stage" / name).rename(tmp_path / "shared" / name)

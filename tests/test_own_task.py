@@ -29,6 +29,7 @@ from sb3_follow_object.envs import (
     register_task,
 )
 from sb3_follow_object.envs.tasks import Landmarks
+from sb3_follow_object.follow_object import FollowObject
 from sb3_follow_object.grid import Settings, plan
 
 from .test_cli import TINY
@@ -104,7 +105,7 @@ def test_a_grid_calls_it_by_its_short_name(own: Task, tmp_path: Path) -> None:
         (lambda: Region("gripper", (0.1, 0.0), (0.0, 0.1)), "is empty"),
         (lambda: Region("robot", (0.0, 0.0), (0.1, 0.1)), "'gripper' or 'table'"),  # type: ignore[arg-type]
         (lambda: Task("Push Past", NEAR, FAR), "letters and digits"),
-        (lambda: Task("PushPast", NEAR, FAR, horizon=0), "must be >= 1"),
+        (lambda: Task("PushPast", NEAR, FAR, horizon=0), "whole number >= 1"),
         (lambda: Task("PushPast", NEAR, FAR, obstacles=[]), "tuples"),  # type: ignore[arg-type]
     ],
 )
@@ -150,3 +151,23 @@ def test_commands_train_resume_and_test_it_in_processes_of_their_own(tmp_path: P
     # And through Python, where the configuration tells the module.
     assert load_config(run).full_id == FULL
     forget()
+
+
+def test_a_module_before_the_id_does_not_change_the_kind() -> None:
+    code = "from sb3_follow_object.envs import make_vec\n"
+    code += f"print(type(make_vec({FULL!r}, 2, 1)).__name__)"
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "PYTHONWARNINGS": "ignore"}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1:] == ["FetchVecEnv"], done.stderr
+
+
+def test_a_save_is_loaded_where_its_module_was_not_imported(tmp_path: Path) -> None:
+    network = {"policy_kwargs": {"net_arch": [8]}, "gradient_steps": 1, "batch_size": 8}
+    run = FollowObject(FULL, imagine=False, n_envs=1, n_threads=1, algorithm=network)
+    run.learn(run.horizon).save(tmp_path / "save")
+    run.close()
+    code = "from sb3_follow_object import FollowObject\n"
+    code += f"print(FollowObject.load({str(tmp_path / 'save')!r}).env_id)"
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "PYTHONWARNINGS": "ignore"}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1:] == [OWN], done.stderr

@@ -80,7 +80,7 @@ def test_a_resting_object_stays_and_the_gripper_stands_at_its_place(name: str) -
     marks = fetch_scene(TASKS[name]).landmarks
     np.testing.assert_allclose(marks.gripper, (1.342, 0.749, 0.535), atol=1e-3)
     assert marks.rest_height == pytest.approx(0.425, abs=1e-3)
-    env = ObjectEnv("PnPSimpleV1")
+    env = ObjectEnv(name)
     obs, _ = env.reset(seed=0)
     for _ in range(5):
         later, *_ = env.step(np.zeros(7))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_follow_object.callbacks import OriginalGoalEvalCallback
+from sb3_follow_object.eval_callback import OriginalGoalEvalCallback
 from sb3_follow_object.experiment import CONFIG, EVALUATIONS, RunConfig
 from sb3_follow_object.plots import draw_curves, read_curve, spread
 

@@ -7,12 +7,15 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
-from sb3_follow_object import extras
+from sb3_follow_object import extras, ray_executor
 from sb3_follow_object.cli import main
-from sb3_follow_object.ray_executor import _write_files
+from sb3_follow_object.files import lock
+from sb3_follow_object.ray_executor import RayExecutor, _write_files
+from sb3_follow_object.worker import TRAIN, Job
 
 TINY = ["policy_kwargs.net_arch=[8]", "batch_size=16", "gradient_steps=2", "n_envs=2"]
 TINY += ["object_timesteps=800", "n_paths=16", "predictor_fit.epochs=1", "predictor_fit.hidden=[8]"]
@@ -98,3 +101,54 @@ def test_ray_that_is_not_installed_is_one_sentence(
     assert main([*words, "--methods", "her", "--ray", "local"]) == 2
     assert "pip install 'sb3-follow-object[ray]'" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+@pytest.fixture
+def fake_ray(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+    """Ray's calls without a cluster: tasks end when a test says so."""
+    ray = MagicMock()
+    ray.exceptions.RayError = type("RayError", (Exception,), {})
+    monkeypatch.setattr(ray_executor, "need", lambda module, extra: ray)
+    return ray
+
+
+@pytest.mark.parametrize("lost", [False, True], ids=["comes back", "node is lost"])
+def test_folder_of_a_run_that_is_away_is_locked_until_it_ends(
+    lost: bool, fake_ray: MagicMock, tmp_path: Path
+) -> None:
+    job = Job(TRAIN, "run", str(tmp_path))
+    executor = RayExecutor(1)
+    executor.start(job)
+    with pytest.raises(ValueError, match="another process works in"):
+        RayExecutor(1).start(job)
+    (reference,) = executor._jobs
+
+    def get(asked: Any) -> Any:
+        if asked is not reference:
+            return []  # of the mailbox
+        if lost:
+            raise fake_ray.exceptions.RayError("the node died")
+        with pytest.raises(ValueError, match="another process"), lock(tmp_path, wait=False):
+            pass  # held until the files are back
+        return {"finished": True}, {"result.json": b"{}"}, set()
+
+    fake_ray.get.side_effect = get
+    fake_ray.wait.return_value = ([reference], [])
+    outcome = {"failed": "RayError: the node died"} if lost else {"finished": True}
+    assert executor.messages(0.0) == [("run", outcome)]
+    assert (tmp_path / "result.json").exists() != lost
+    with lock(tmp_path, wait=False):
+        pass  # free again
+
+
+def test_folder_of_a_run_that_cannot_be_sent_is_free_again(
+    fake_ray: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreadable(folder: Path) -> None:
+        raise OSError("input/output error")
+
+    monkeypatch.setattr(ray_executor, "_read_files", unreadable)
+    with pytest.raises(OSError, match="input/output"):
+        RayExecutor(1).start(Job(TRAIN, "run", str(tmp_path)))
+    with lock(tmp_path, wait=False):
+        pass

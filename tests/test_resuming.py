@@ -22,6 +22,7 @@ from sb3_follow_object.experiment import train
 from sb3_follow_object.follow_object import FollowObject
 from sb3_follow_object.object_networks import FILE as OBJECT_FILE
 from sb3_follow_object.object_networks import ObjectNetworks
+from sb3_follow_object.run_callbacks import StopSignals
 from sb3_follow_object.run_folder import Checkpoints, checkpoint_files, load_newest
 
 pytestmark = pytest.mark.xdist_group("resuming")  # the tests share one run
@@ -298,6 +299,8 @@ def test_killed_runs_resume(whole: dict[str, Any], tmp_path: Path) -> None:
         lambda: (folder / "policy.safetensors").exists(),
     ]
     for again, mark in enumerate(marks):
+        for half_written in folder.glob(".*.tmp"):  # of a kill before; the run itself removes them
+            half_written.unlink()
         code = "import sys, tiny_runs as runs; from pathlib import Path; "
         code += f"runs.run(Path(sys.argv[1]), resume={again > 0})"
         process = subprocess.Popen(
@@ -311,3 +314,11 @@ def test_killed_runs_resume(whole: dict[str, Any], tmp_path: Path) -> None:
     runs.run(folder, resume=True)
     assert runs.outcome(folder) == whole
     assert not list(folder.glob(".*.tmp"))
+
+
+def test_second_signal_ends_at_once() -> None:
+    with StopSignals() as stop:
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.requested
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)

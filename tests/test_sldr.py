@@ -12,13 +12,22 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_follow_object import predictors
 from sb3_follow_object.auxiliary import Transitions
 from sb3_follow_object.checkpoint import load_tree, save_tree
-from sb3_follow_object.envs import TASKS, FetchVecEnv, ObjectVecEnv, make_vec, object_state
+from sb3_follow_object.envs import (
+    TASKS,
+    FetchVecEnv,
+    ObjectVecEnv,
+    make_vec,
+    object_state,
+    physics_id,
+)
+from sb3_follow_object.files import LOCK, lock
 from sb3_follow_object.follow_object import FollowObject
 from sb3_follow_object.her_ddpg import HerDDPG
-from sb3_follow_object.object_networks import ACTION, OBSERVATION, ObjectNetworks
-from sb3_follow_object.predictors import CACHE_VARIABLE, get_object_networks
+from sb3_follow_object.object_networks import ACTION, FILE, OBSERVATION, ObjectNetworks
+from sb3_follow_object.predictors import CACHE_VARIABLE, get_object_networks, get_predictor
 from sb3_follow_object.rollout import run_episodes
 from sb3_follow_object.sldr import SldrReward
 
@@ -337,3 +346,49 @@ def test_half_a_file_and_bad_fits_are_refused(tmp_path: Path, trained: HerDDPG) 
     for bad in ({"hidden": ()}, {"updates": 0}, {"learning_rate": 0.0}):
         with pytest.raises(ValueError, match="inverse_fit: hidden"):
             ObjectNetworks.learned(trained, "toy", "none", **bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("keep", "get", "sentence"),
+    [
+        (cache_predictor, get_object_networks, "has predictor.json but no object_networks"),
+        (cache_networks, get_predictor, "has object_networks.safetensors but no predictor.json"),
+    ],
+    ids=["F_phi alone", "networks alone"],
+)
+def test_half_an_object_stage_is_refused_and_left_alone(
+    keep: Any, get: Any, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(predictors, "learn_predictor", lambda *_: pytest.fail("learned again"))
+    keep(tmp_path)
+    folder = tmp_path / TASK / physics_id(TASK)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(ValueError, match=f"{sentence}.*; give an empty folder"):
+        get(TASK, folder, report=pytest.fail)
+    after = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != LOCK}
+    assert after == before
+
+
+def test_half_an_object_stage_in_the_cache_is_learned_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    cache_predictor(tmp_path)
+    learned: list[Path] = []
+
+    def learn(config: Any, folder: Path, report: Any) -> None:
+        with pytest.raises(ValueError, match="another process"), lock(folder, wait=False):
+            pass
+        tiny_networks().save(folder / FILE)
+        learned.append(folder)
+
+    monkeypatch.setattr(predictors, "learn_predictor", learn)
+    for _ in range(2):
+        assert get_object_networks(TASK, report=pytest.fail).env_id == TASK
+    assert learned == [tmp_path / TASK / physics_id(TASK)]
+
+
+def test_networks_of_other_physics_are_refused(tmp_path: Path) -> None:
+    tiny_networks().save(tmp_path / "networks")
+    with pytest.raises(ValueError, match="were made for physics"):
+        ObjectNetworks.load(tmp_path / "networks", physics="another")

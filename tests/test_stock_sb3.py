@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import RescaleAction
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
@@ -253,3 +254,21 @@ def test_the_script_in_the_docs_runs(tmp_path: Path) -> None:
     exec(batch, names := {})
     assert names["env"].num_envs == 16
     names["env"].close()
+
+
+@pytest.mark.parametrize(
+    ("wrap", "sentence"),
+    [
+        (lambda: RescaleAction(gym.make(TASK), -0.1, 0.1), "actions"),  # type: ignore[arg-type]
+        (lambda: gym.make(TASK, max_episode_steps=5), "steps an episode"),
+    ],
+)
+def test_copies_for_tests_that_would_be_other_environments_are_refused(
+    wrap: Callable[[], gym.Env], sentence: str
+) -> None:
+    made = get_predictor(TASK)
+    env = wrap()
+    made.horizon = env.spec.max_episode_steps  # type: ignore[union-attr, assignment]
+    model = learner(ImaginedGoalWrapper(env, made, SETTINGS))
+    with pytest.raises(ValueError, match=f"The training's {sentence} .* with the same wrappers"):
+        model.learn(HORIZON, callback=CurriculumCallback())
