@@ -8,11 +8,6 @@ INSTALLED := $(VENV)/.installed
 ENV ?= FollowObject/PnPShelf-v0
 RUN ?= runs/pnp-shelf
 
-# mujoco draws through a window unless told otherwise; EGL needs none.
-ifeq ($(shell uname -s),Linux)
-export MUJOCO_GL ?= egl
-endif
-
 .PHONY: train test lint bench test-mujoco-range clean
 
 train: $(INSTALLED)

@@ -114,7 +114,7 @@ class _Canvas:
     """Off-screen drawing of one model."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self._context = _graphics_context()
+        self._context = open_graphics(SIZE)[1]
         self._context.make_current()
         model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
         self._model = model
@@ -193,20 +193,39 @@ def _copy_state(
     mujoco.mj_forward(model, data)
 
 
-def _graphics_context() -> Any:
-    """A context of the library that MUJOCO_GL names, or else of the first one that works here."""
+def open_graphics(size: int) -> tuple[str, Any]:
+    """Name and context of the library in MUJOCO_GL, or else of the first one that works here.
+
+    Args:
+        size: width and height of the context's pictures, pixels.
+
+    Raises:
+        RuntimeError: none works.
+    """
     named = os.environ.get("MUJOCO_GL")
     screen = ["glfw"] if "DISPLAY" in os.environ else []
+    platform = os.environ.get("PYOPENGL_PLATFORM")
     reasons = []
     for library in [named] if named else [*screen, "egl", "osmesa"]:
         try:
-            return import_module(f"mujoco.{library}").GLContext(SIZE, SIZE)
+            return library, import_module(f"mujoco.{library}").GLContext(size, size)
         except Exception as error:  # each library fails with errors of its own
             reasons.append(f"{library}: {error}")
+            _forget_opengl(platform)
     raise RuntimeError(
         "There is no OpenGL to draw with; install libegl1 or libosmesa6, or set MUJOCO_GL to "
         f"the library there is ({'; '.join(reasons)})."
     )
+
+
+def _forget_opengl(platform: str | None) -> None:
+    """Let the next library be tried: what was imported for one that failed is bound to it."""
+    os.environ.pop("PYOPENGL_PLATFORM", None)
+    if platform is not None:
+        os.environ["PYOPENGL_PLATFORM"] = platform
+    for name in list(sys.modules):
+        if name.partition(".")[0] == "OpenGL" or name.startswith(("mujoco.egl", "mujoco.osmesa")):
+            del sys.modules[name]
 
 
 def _point(camera: Any) -> None:

@@ -21,6 +21,15 @@ if TYPE_CHECKING:
     from .experiment import RunConfig
 
 PROGRAM = "sb3-follow-object"
+# Settings that only runs with imagined goals read.
+_OF_IMAGINED = (
+    "curriculum",
+    "predictor_fit",
+    "n_paths",
+    "test_every",
+    "n_test_episodes",
+    "store_tests",
+)
 USER_ERROR, INTERRUPTED = 2, 130
 CURVE, VIDEO = "curve.png", "video.mp4"
 
@@ -269,7 +278,7 @@ def _config(args: argparse.Namespace) -> RunConfig:
     overrides = {"n_timesteps": args.steps, "n_envs": args.n_envs}
     overrides |= {"n_threads": args.threads, "torch_threads": args.threads}
     overrides = {name: value for name, value in overrides.items() if value is not None}
-    return run_config(
+    config = run_config(
         args.env,
         method=args.method,
         preset=args.preset or "default",
@@ -277,6 +286,12 @@ def _config(args: argparse.Namespace) -> RunConfig:
         seed=args.seed or 0,
         overrides=overrides | dict(parse_override(text) for text in args.set),
     )
+    for text in args.set:
+        if text.split("=")[0].split(".")[0] in _OF_IMAGINED and not config.settings["imagine"]:
+            raise ValueError(
+                f"--set {text} does nothing: method {config.method!r} imagines no goals"
+            )
+    return config
 
 
 def _resumed_config(args: argparse.Namespace) -> RunConfig:
@@ -335,7 +350,7 @@ def _watch(args: argparse.Namespace) -> None:
     from .pictures import record
 
     config = load_config(args.run)
-    out = args.out or args.run / VIDEO
+    out = _named(args.out or args.run / VIDEO, ".mp4")
     rate = record(args.run / POLICY, config.env_id, out, args.episodes, args.seed)
     print(f"{out}: {args.episodes} episodes, success {rate:.2f}")
 
@@ -351,8 +366,15 @@ def _plot(args: argparse.Namespace) -> None:
             print(path)
         return
     out = args.out or (args.runs[0] / CURVE if len(args.runs) == 1 else Path(CURVE))
-    draw_curves(args.runs, out)
+    draw_curves(args.runs, _named(out, ".png"))
     print(out)
+
+
+def _named(out: Path, ending: str) -> Path:
+    """Return a file's path, if its name says what will be in it."""
+    if out.suffix.lower() != ending:
+        raise ValueError(f"{out} does not end in {ending}, which is what is written")
+    return out
 
 
 def _compare(args: argparse.Namespace) -> None:
@@ -413,7 +435,9 @@ def _print_table(row: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(*row)
+    table = Table()
+    for name in row:
+        table.add_column(name, overflow="fold")  # of names that differ in their last letter only
     table.add_row(*map(_cell, row.values()))
     Console().print(table)
 

@@ -16,6 +16,7 @@ from .experiment import POLICY, trained_steps
 from .extras import MissingExtra
 from .grid import ATTEMPTS, OBJECT, Cell, Ledger, Settings, prepare, shared_stage, stage_is_ready
 from .grid_display import GridDisplay
+from .reports import Trouble
 from .worker import CROSS, STAGE, TRAIN, Job
 
 _POLL = 1.0  # seconds
@@ -203,7 +204,7 @@ class Comparison:
             self._failures[name] = self._failures.get(name, 0) + 1
             last = self._failures[name] >= ATTEMPTS
         again = "it failed twice and is given up" if last else "it is taken up once more"
-        self._display.say(f"{name} failed: {error}; {again}")
+        self._display.say(Trouble(f"{name} failed: {error}; {again}"))
 
 
 @contextmanager

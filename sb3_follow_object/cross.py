@@ -11,9 +11,8 @@ from .config import load_config
 from .experiment import POLICY, evaluate
 from .files import atomic_write
 from .grid import task_name
+from .run_folder import CROSS_TESTS
 from .task_ids import check_task
-
-CROSS_TESTS = "cross_tests.json"
 
 # Section 5.3: one task with two samplers of starts and goals; HER-a is trained on the first,
 # HER-b on the second, and each is tested on both.

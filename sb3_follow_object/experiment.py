@@ -21,12 +21,13 @@ from .eval_callback import OriginalGoalEvalCallback
 from .files import atomic_write, lock, remove_half_written
 from .follow_object import FollowObject
 from .object_policy import StopWhenSolved
-from .object_stage import Report
 from .policies import load_actor
+from .reports import Report, Trouble
 from .rollout import Episodes, run_episodes
 from .run_callbacks import CheckpointCallback, Progress, RunCallback, StopSignals
 from .run_folder import (
     CONFIG,
+    CROSS_TESTS,
     EVALUATIONS,
     OBJECT_STAGE,
     POLICY,
@@ -116,6 +117,7 @@ def train(
         if not resume:
             folder.mkdir(parents=True, exist_ok=True)
             stack.enter_context(lock(folder, wait=False))
+            remove_half_written(folder)
             claim(folder, config, command)
         checkpoints = Checkpoints(folder, config.keep_checkpoints, report)
         stack.callback(checkpoints.wait)
@@ -176,6 +178,16 @@ def _robot_stage(
         checkpoints.take_memory(keeper.state_dict())
         run.report(f"resumed at {run.env_steps} env steps")
     del saved
+    # Those of the policy that is trained further from here on.
+    (folder / RESULT).unlink(missing_ok=True)
+    (folder / CROSS_TESTS).unlink(missing_ok=True)
+    if run.env_steps >= config.total_timesteps:
+        run.report(
+            Trouble(
+                f"{run.env_steps} env steps are gone of {config.total_timesteps}: "
+                "nothing is left for the robot to learn in"
+            )
+        )
     model.set_logger(_logger(folder, run.env_steps))
     writer = CheckpointCallback(
         checkpoints, keeper.state_dict, lambda: run.env_steps, config.checkpoint_minutes, stop
@@ -212,6 +224,7 @@ def _final_test(
         "command": noted_command(folder, command),
         "k_max": run.curriculum.k_max if run.imagine else None,
     }
+    (folder / CROSS_TESTS).unlink(missing_ok=True)  # of an earlier policy
     atomic_write(folder / RESULT, json.dumps(result, indent=2).encode())
     return result
 

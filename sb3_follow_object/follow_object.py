@@ -25,8 +25,9 @@ from .her_ddpg import HerDDPG
 from .keywords import with_tuples
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
-from .object_stage import ObjectStage, Report
+from .object_stage import ObjectStage
 from .policies import save_actor
+from .reports import Report
 from .resuming import (
     FreshEpisodes,
     begin_new_episodes,

@@ -196,17 +196,19 @@ def prepare(cell: Cell, stage: Path | None) -> None:
     The stage's env steps are told with it, so each run that uses it counts them.
     """
     if not (cell.folder / CONFIG).exists():
-        _claim_whole(cell.folder, cell.config, stage)
+        _claim_whole(cell.folder, cell.config, stage, cell.command)
 
 
-def _claim_whole(folder: Path, config: RunConfig, stage: Path | None = None) -> None:
+def _claim_whole(
+    folder: Path, config: RunConfig, stage: Path | None = None, command: str = ""
+) -> None:
     """Make a run's folder appear as a whole: a part of one could not be resumed."""
     new = folder.with_name(f".{folder.name}.new")
     shutil.rmtree(new, ignore_errors=True)
     new.mkdir(parents=True)
     if _is_empty(folder):
         shutil.rmtree(folder)
-    claim(new, config)
+    claim(new, config, command)
     for path in stage.iterdir() if stage else ():
         if path.is_dir():
             shutil.copytree(path, new / path.name)

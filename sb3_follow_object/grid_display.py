@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+
+from .progress import Terminal
 
 # Seconds between two reports where there is no terminal to draw on.
 _LINES_EVERY = 60.0
@@ -17,12 +18,12 @@ class GridDisplay:
     """Shows each job under way, how many runs are done and about how long the rest will take.
 
     Args:
-        quiet: show nothing.
+        quiet: show nothing but trouble.
         clock: tells the time in seconds.
     """
 
     def __init__(self, quiet: bool = False, clock: Any = time.monotonic):
-        self._console = Console(quiet=quiet)
+        self._console = Terminal(quiet=quiet)
         self._clock = clock
         self._running: dict[str, dict[str, Any]] = {}
         self._left: dict[str, int] = {}  # env steps, by cell
@@ -45,7 +46,7 @@ class GridDisplay:
 
     def say(self, sentence: str) -> None:
         """Print a sentence above the table."""
-        self._console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+        self._console.say(sentence)
 
     def expect(self, name: str, total: int, done: int) -> None:
         """Take a cell's env steps, in all and done already, into the estimate."""

@@ -19,9 +19,8 @@ from .object_policy import (
     keeps_object_on_table,
     train_object_policy,
 )
+from .reports import Report
 from .seeds import stream_seed
-
-Report = Callable[[str], None]
 
 
 class ObjectStage:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from .envs import IDS
+from .envs.picture import open_graphics
 from .extras import need
 from .files import atomic_write
 from .goal_predictor import GoalPredictor
@@ -132,14 +132,9 @@ def _name_graphics_library() -> None:
     """Spare gymnasium's renderer its first try, a window, which ends a process without a screen."""
     if sys.platform != "linux" or {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
         return
-    for library in ("egl", "osmesa"):
-        try:
-            import_module(f"mujoco.{library}").GLContext(8, 8).free()
-        except Exception:  # each library fails with errors of its own
-            continue
-        os.environ["MUJOCO_GL"] = library
-        return
-    raise RuntimeError("there is no OpenGL to draw with; install libegl1 or libosmesa6")
+    library, context = open_graphics(8)
+    context.free()
+    os.environ["MUJOCO_GL"] = library
 
 
 def _frame(env: gym.Env) -> np.ndarray:

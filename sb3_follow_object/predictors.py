@@ -14,8 +14,8 @@ from .goal_predictor import GoalPredictor
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
 from .object_policy import keeps_object_on_table
-from .object_stage import Report
 from .predictor_files import FACTS_FILE
+from .reports import Report
 from .run_folder import RunConfig
 
 _FILES = (FACTS_FILE, OBJECT_FILE)

@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
+import errno
+import sys
 import time
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from .reports import Trouble
+
 # Seconds between two lines where there is no terminal to draw a bar on.
 _LINE_EVERY = 60.0
+
+
+class Terminal(Console):
+    """A console that reports a reader who has gone as the OSError it is, instead of leaving."""
+
+    def on_broken_pipe(self) -> None:
+        """Called where nobody reads any more."""
+        raise OSError(errno.EPIPE, "nobody reads the standard output any more")
+
+    def say(self, sentence: str) -> None:
+        """Print a sentence; trouble goes to the standard error where the rest is not shown."""
+        if self.quiet and isinstance(sentence, Trouble):
+            print(sentence, file=sys.stderr)
+        self.print(sentence, markup=False, highlight=False, soft_wrap=True)
 
 
 class ProgressBar:
@@ -17,13 +35,13 @@ class ProgressBar:
 
     Args:
         total: env steps of the whole run.
-        quiet: show nothing.
+        quiet: show nothing but trouble.
     """
 
     def __init__(self, total: int, quiet: bool = False):
         self._quiet = quiet
         self._total = total
-        self._console = Console(quiet=quiet)
+        self._console = Terminal(quiet=quiet)
         self._bar = Progress(
             TextColumn("{task.completed:,.0f}/{task.total:,.0f} steps"),
             BarColumn(),
@@ -46,7 +64,7 @@ class ProgressBar:
 
     def say(self, sentence: str) -> None:
         """Print a sentence above the bar."""
-        self._console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+        self._console.say(sentence)
 
     def update(self, figures: dict[str, Any]) -> None:
         """Show the figures that `train` reports after each rollout."""

@@ -20,13 +20,15 @@ from .follow_object import FollowObject
 from .goal_predictor import GoalPredictor
 from .object_networks import FILE as OBJECT_FILE
 from .object_networks import ObjectNetworks
-from .object_stage import Report
 from .predictor_files import FACTS_FILE
+from .reports import Report, Trouble
 
 CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
 PREDICTOR, OBJECT_STAGE = "predictor", "object_stage.json"
 POLICY, BEST_POLICY = "policy.safetensors", "best_policy.safetensors"
 CHECKPOINTS = "checkpoint-*.safetensors"
+VERSIONS = "versions.json"
+CROSS_TESTS = "cross_tests.json"  # the policy on other tasks
 COMMAND = "command.txt"  # what started the run, and what gave it other steps later
 PACKAGES = ["sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics"]
 PACKAGES += ["mujoco", "torch", "numpy"]
@@ -100,10 +102,14 @@ class RunConfig:
 
 def check_empty(folder: Path) -> None:
     """Raise a ValueError unless a run can start in the folder."""
-    if folder.exists() and not (
-        folder.is_dir() and all(entry.name == LOCK for entry in folder.iterdir())
-    ):
+    if folder.exists() and not (folder.is_dir() and all(map(_is_of_a_start, folder.iterdir()))):
         raise ValueError(f"{folder} is not empty; resume the run in it or give another folder")
+
+
+def _is_of_a_start(path: Path) -> bool:
+    """Whether a file is what a start leaves that did not come to the configuration."""
+    half_written = path.name.startswith(".") and path.suffix == ".tmp"
+    return half_written or path.name in (LOCK, VERSIONS, COMMAND)
 
 
 def check_same_run(folder: Path, config: RunConfig) -> None:
@@ -149,7 +155,7 @@ def claim(folder: Path, config: RunConfig, command: str = "") -> None:
     check_empty(folder)  # again, now that no other process can come in between
     versions: dict[str, str | None] = {n: importlib.metadata.version(n) for n in PACKAGES}
     versions |= {"python": platform.python_version(), "commit": source_commit()}
-    atomic_write(folder / "versions.json", json.dumps(versions, indent=2).encode())
+    atomic_write(folder / VERSIONS, json.dumps(versions, indent=2).encode())
     if command:
         atomic_write(folder / COMMAND, f"{command}\n".encode())
     atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
@@ -319,7 +325,7 @@ def load_newest(folder: Path, report: Report) -> Any:
             return load_tree(path)
         except ValueError as error:
             reason = str(error)
-            report(f"{reason}; taking the one before it")
+            report(Trouble(f"{reason}; taking the one before it"))
     if files:
         raise ValueError(
             f"every checkpoint in {folder} is damaged; remove them to start the run again"
@@ -396,10 +402,10 @@ class Checkpoints:
             )
         except OSError as error:
             kept = checkpoint_files(self.folder)
-            self._outcome = (
+            rest = f"the last good one is {kept[-1].name}" if kept else "there is no other so far"
+            self._outcome = Trouble(
                 f"the checkpoint at {env_steps} env steps could not be written "
-                f"({error.strerror or error}); "
-                + (f"the last good one is {kept[-1].name}" if kept else "there is no other so far")
+                f"({error.strerror or error}); {rest}"
             )
 
     def _drop_old(self, newest: Path) -> None:

@@ -18,7 +18,8 @@ def check_task(env_id: str) -> str:
     """Return an id without a module's name, if a robot can pursue goals there.
 
     Raises:
-        ValueError: gymnasium does not know the id, or the environment has no goals or no horizon.
+        ValueError: gymnasium does not know the id, or the environment has no goals or no horizon
+            or does not tell whether a goal is reached.
     """
     name = import_task(env_id)
     if name not in gym.registry:
@@ -38,9 +39,26 @@ def check_task(env_id: str) -> str:
             )
         if env.spec is None or env.spec.max_episode_steps is None:
             raise ValueError(f"{env_id!r} does not say how long its episodes are")
+        if _hides_success(env):
+            raise ValueError(f"{env_id!r} does not tell in its info whether the goal is reached")
     finally:
         env.close()
     return name
+
+
+def _hides_success(env: gym.Env) -> bool:
+    """Whether a whole episode's info never says `is_success`."""
+    try:
+        env.reset(seed=0)
+        over = False
+        while not over:
+            _, _, terminated, truncated, info = env.step(env.action_space.sample())
+            if "is_success" in info:
+                return False
+            over = terminated or truncated
+        return True
+    except Exception:  # an environment of somebody's may raise anything; training will tell it
+        return False
 
 
 def known_id(env_id: str) -> str:
@@ -66,7 +84,7 @@ def import_task(env_id: str) -> str:
     if module:
         try:
             import_module(module)
-        except ImportError as error:
+        except (ImportError, TypeError, ValueError) as error:  # a relative name, an empty part
             raise ValueError(
                 f"{env_id!r} names a module that cannot be imported ({error}); "
                 "is it installed, or its folder on PYTHONPATH?"

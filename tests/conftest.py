@@ -14,8 +14,6 @@ from tree import PACKAGES, ROOT, run
 
 # Small networks and small scenes: more threads only make the test processes wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-if sys.platform == "linux":
-    os.environ.setdefault("MUJOCO_GL", "egl")
 
 DRAW_ONE_PICTURE = """
 import mujoco
@@ -27,12 +25,21 @@ renderer.close()
 @pytest.fixture(scope="session")
 def can_draw() -> None:
     """Skips where mujoco finds no OpenGL; asks a process of its own, which a driver may end."""
-    tried = subprocess.run(
-        [sys.executable, "-c", DRAW_ONE_PICTURE], capture_output=True, text=True, check=False
-    )
-    if tried.returncode != 0:
+    reasons = []
+    for library in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else ["egl", "osmesa"]:
+        tried = subprocess.run(
+            [sys.executable, "-c", DRAW_ONE_PICTURE],
+            env={**os.environ, "MUJOCO_GL": library},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if tried.returncode == 0:
+            os.environ["MUJOCO_GL"] = library
+            return
         last_line = (tried.stderr.strip().splitlines() or [f"exit {tried.returncode}"])[-1]
-        pytest.skip(f"no OpenGL for MUJOCO_GL={os.environ.get('MUJOCO_GL', '')}: {last_line}")
+        reasons.append(f"{library}: {last_line}")
+    pytest.skip(f"no OpenGL ({'; '.join(reasons)})")
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shlex
@@ -16,11 +17,14 @@ import numpy as np
 import pytest
 
 from sb3_follow_object import extras
-from sb3_follow_object.cli import main
+from sb3_follow_object.cli import _print_table, main
 from sb3_follow_object.envs import physics_id
+from sb3_follow_object.files import LOCK
 from sb3_follow_object.goal_predictor import GoalPredictor
 from sb3_follow_object.predictors import CACHE_VARIABLE, get_predictor
-from sb3_follow_object.progress import ProgressBar
+from sb3_follow_object.progress import ProgressBar, Terminal
+from sb3_follow_object.reports import Trouble
+from sb3_follow_object.run_folder import check_empty
 
 pytestmark = pytest.mark.xdist_group("cli")  # the tests share one run
 
@@ -280,3 +284,38 @@ def test_help_does_not_wait_for_torch() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     modules = set(done.stdout.splitlines()[-1].split())
     assert not {"torch", "mujoco", "stable_baselines3", "matplotlib"} & modules
+
+
+def test_quiet_does_not_hide_trouble(capsys: pytest.CaptureFixture[str]) -> None:
+    terminal = Terminal(quiet=True)
+    terminal.say("all is well")
+    terminal.say(Trouble("the disk is full"))
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err) == ("", "the disk is full\n")
+
+
+def test_a_reader_who_has_gone_is_an_error_like_others() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as gone:
+        with pytest.raises(OSError, match="nobody reads"):
+            Terminal(file=gone).say("hello")
+        with contextlib.suppress(BrokenPipeError):
+            gone.close()
+
+
+def test_what_a_start_left_does_not_bar_the_next(tmp_path: Path) -> None:
+    """A full disk, or a kill, before the configuration was written."""
+    for name in ("versions.json", "command.txt", ".config.json.abc.tmp", LOCK):
+        (tmp_path / name).write_text("{}")
+    check_empty(tmp_path)
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="is not empty"):
+        check_empty(tmp_path)
+
+
+def test_tables_show_whole_names(capsys: pytest.CaptureFixture[str]) -> None:
+    _print_table({"env": "FollowObject/PnPSimpleV2-v0" * 3, "command": "x" * 100, "success": 0.5})
+    printed = capsys.readouterr().out
+    assert "\u2026" not in printed
+    assert printed.count("x") == 100

@@ -18,6 +18,7 @@ from sb3_follow_object.grid import (
     shared_stage,
     stage_settings,
 )
+from sb3_follow_object.run_folder import noted_command
 
 SETTINGS = Settings(steps=1000, overrides={"n_envs": 2})
 
@@ -102,6 +103,14 @@ def test_run_is_resumed_with_the_threads_it_began_with(tmp_path: Path) -> None:
     (again,) = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS, threads=1)
     assert again.config == cell.config
     assert again.config.torch_threads == 3
+
+
+def test_run_keeps_the_command_that_its_settings_come_from(tmp_path: Path) -> None:
+    """Also where `train --resume` ends it."""
+    (cell,) = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS)
+    prepare(cell, None)
+    assert "--method her" in cell.command
+    assert noted_command(cell.folder, "train --resume") == cell.command
 
 
 def test_damaged_grid_file_is_refused(tmp_path: Path) -> None:

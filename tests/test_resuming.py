@@ -23,7 +23,7 @@ from sb3_follow_object.follow_object import FollowObject
 from sb3_follow_object.object_networks import FILE as OBJECT_FILE
 from sb3_follow_object.object_networks import ObjectNetworks
 from sb3_follow_object.run_callbacks import StopSignals
-from sb3_follow_object.run_folder import Checkpoints, checkpoint_files, load_newest
+from sb3_follow_object.run_folder import CROSS_TESTS, Checkpoints, checkpoint_files, load_newest
 
 pytestmark = pytest.mark.xdist_group("resuming")  # the tests share one run
 
@@ -221,7 +221,14 @@ def test_finished_run_given_more_steps_is_the_longer_run(
     assert runs.run(tmp_path, config=shorter, command="train")["env_steps"] < 3600
     assert len(checkpoint_files(tmp_path)) == 1
     longer = runs.config(keep_last_checkpoint=True)
-    result = runs.run(tmp_path, config=longer, command="go on", resume=True)
+    (tmp_path / CROSS_TESTS).write_text("{}")
+    seen = []
+
+    def look(figures: dict[str, Any]) -> None:
+        seen.append((tmp_path / "result.json").exists() or (tmp_path / CROSS_TESTS).exists())
+
+    result = runs.run(tmp_path, config=longer, command="go on", resume=True, progress=look)
+    assert seen and not any(seen), "what is said of the shorter run's policy"
     assert result["command"] == "train && go on"
     assert runs.run(tmp_path, config=longer, resume=True) == result  # finished
     checkpoint_files(tmp_path)[0].unlink()
