@@ -5,22 +5,19 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
-from .methods import METHODS
+from .cli_options import CURVE, PROGRAM, USER_ERROR, VIDEO, make_parser
 
 # Nothing heavier here: --help must not wait for torch. The commands import what they use.
 
 if TYPE_CHECKING:
     from .experiment import RunConfig
 
-PROGRAM = "sb3-follow-object"
 # Settings that only runs with imagined goals read.
 _OF_IMAGINED = (
     "curriculum",
@@ -30,36 +27,7 @@ _OF_IMAGINED = (
     "n_test_episodes",
     "store_tests",
 )
-USER_ERROR, INTERRUPTED = 2, 130
-CURVE, VIDEO = "curve.png", "video.mp4"
-
-
-class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line."""
-
-    def error(self, message: str) -> NoReturn:
-        message += self._nearest(message)
-        self.exit(USER_ERROR, f"{PROGRAM}: {message} (see {self.prog} --help)\n")
-
-    def _nearest(self, message: str) -> str:
-        """Return what may have been meant by a word that argparse does not know."""
-        choice = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
-        option = re.search(r"unrecognized arguments: (--[\w-]+)", message)
-        near: list[str] = []
-        if choice:
-            near = get_close_matches(choice[1], re.findall(r"[\w-]+", choice[2]), n=1)
-        elif option:
-            known = {*self._options()} - {option[1]}  # another command may have it
-            near = get_close_matches(option[1], known, n=1, cutoff=0.7)
-        return f"; did you mean {near[0]!r}?" if near else ""
-
-    def _options(self) -> list[str]:
-        """Return the options of this parser and of its commands."""
-        known = list(self._option_string_actions)
-        for action in self._actions:
-            if isinstance(action.choices, dict):  # the commands
-                known += [name for parser in action.choices.values() for name in parser._options()]
-        return known
+INTERRUPTED = 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the arguments after the program's name; by default the process's.
     """
     arguments = sys.argv[1:] if argv is None else list(argv)
-    args = _parser().parse_args(arguments)
+    args = make_parser(_COMMANDS).parse_args(arguments)
     args.command_line = shlex.join([PROGRAM, *arguments])
     try:
         args.run_command(args)
@@ -94,128 +62,6 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.strerror}: {error.filename}"
     return " ".join(str(error).split())
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog=PROGRAM, description="Follow the Object for Stable-Baselines3.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    _add_train(commands)
-    _add_about_runs(commands)
-    _add_compare(commands)
-
-    predictor = commands.add_parser("predictor", help="learn F_phi alone, stages one and two")
-    predictor.set_defaults(run_command=_predictor, method="fo")
-    predictor.add_argument("--out", type=Path, required=True, metavar="FOLDER")
-    _add_settings(predictor)
-    return parser
-
-
-def _add_train(commands: Any) -> None:
-    """Add the command that trains in a run folder."""
-    train = commands.add_parser("train", help="train a robot in a run folder")
-    train.set_defaults(run_command=_train)
-    train.add_argument("--run", type=Path, required=True, metavar="FOLDER", help="run folder")
-    _add_settings(train)
-    train.add_argument("--method", choices=METHODS, help="default: fo")
-    train.add_argument(
-        "--steps",
-        type=int,
-        metavar="N",
-        help="env steps, all stages counted; with --resume: other ones than before",
-    )
-    train.add_argument("--n-envs", type=int, metavar="N", help="parallel copies of the robot")
-    train.add_argument(
-        "--threads", type=int, metavar="N", help="threads of the simulation and of PyTorch"
-    )
-    again = train.add_mutually_exclusive_group()
-    again.add_argument("--resume", action="store_true", help="go on with the run in the folder")
-    again.add_argument(
-        "--resume-or-start", action="store_true", help="go on if the folder holds a run, else start"
-    )
-    train.add_argument("--quiet", action="store_true", help="print nothing but errors")
-
-
-def _add_about_runs(commands: Any) -> None:
-    """Add the commands that test, film and draw what is in run folders."""
-    evaluate = commands.add_parser("evaluate", help="test a run's policy on original goals")
-    evaluate.set_defaults(run_command=_evaluate)
-    evaluate.add_argument("run", type=Path, help="folder with policy.safetensors and config.json")
-    evaluate.add_argument("--episodes", type=int, default=380, metavar="N", help="default: 380")
-    evaluate.add_argument("--seed", type=int, metavar="N", help="of the episodes; default: run's")
-    evaluate.add_argument(
-        "--env", metavar="ID", help="another task; the figure is kept in RUN for plot --results"
-    )
-    evaluate.add_argument("--json", action="store_true", help="print one JSON object")
-
-    watch = commands.add_parser("watch", help="film a run's policy")
-    watch.set_defaults(run_command=_watch)
-    watch.add_argument("run", type=Path, help="folder with policy.safetensors and config.json")
-    watch.add_argument("--episodes", type=int, default=5, metavar="N", help="default: 5")
-    watch.add_argument("--seed", type=int, default=0, metavar="N", help="of the episodes")
-    watch.add_argument("--out", type=Path, metavar="FILE.mp4", help=f"default: RUN/{VIDEO}")
-
-    plot = commands.add_parser("plot", help="draw success and k_max of one or several runs")
-    plot.set_defaults(run_command=_plot)
-    plot.add_argument("runs", type=Path, nargs="*", metavar="RUN", help="run folders")
-    plot.add_argument(
-        "--results", type=Path, metavar="FOLDER", help="draw the paper's figures of all runs in it"
-    )
-    plot.add_argument(
-        "--out",
-        type=Path,
-        metavar="PATH",
-        help=f"PNG, default: RUN/{CURVE}, or of several {CURVE}; of --results a folder",
-    )
-
-
-def _add_compare(commands: Any) -> None:
-    """Add the command that runs a grid."""
-    compare = commands.add_parser("compare", help="run a grid of tasks, methods and seeds")
-    compare.set_defaults(run_command=_compare)
-    compare.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="of the results")
-    compare.add_argument("--tasks", nargs="+", required=True, metavar="TASK", help="e.g. PnPShelf")
-    compare.add_argument(
-        "--methods", nargs="+", required=True, metavar="METHOD", help="e.g. fo her"
-    )
-    compare.add_argument(
-        "--seeds", nargs="+", type=int, default=[0], metavar="N", help="default: 0"
-    )
-    compare.add_argument("--steps", type=int, metavar="N", help="env steps of each run")
-    compare.add_argument("--preset", choices=("default", "paper"), default="default")
-    _add_set(compare)
-    compare.add_argument(
-        "--paper-evaluation",
-        action="store_true",
-        help="validate on 380 episodes after each of the paper's epochs of 1,900 episodes",
-    )
-    compare.add_argument("--jobs", type=int, metavar="N", help="runs at once; default: as fit")
-    compare.add_argument("--threads", type=int, metavar="N", help="cores of each run")
-    compare.add_argument("--ray", metavar="ADDRESS", help="of a Ray cluster, or local")
-    compare.add_argument(
-        "--retry-failed", action="store_true", help="try runs again that were given up"
-    )
-    compare.add_argument("--quiet", action="store_true", help="print nothing but errors")
-
-
-def _add_settings(parser: argparse.ArgumentParser) -> None:
-    """Options that say which task is trained and how."""
-    parser.add_argument("--env", metavar="ID", help="task, e.g. FollowObject/PnPShelf-v0")
-    parser.add_argument("--seed", type=int, metavar="N", help="decides the whole run; default: 0")
-    source = parser.add_mutually_exclusive_group()
-    source.add_argument("--preset", choices=("default", "paper"), help="settings of the package")
-    source.add_argument("--config", type=Path, metavar="FILE.yml", help="settings of your own")
-    _add_set(parser)
-
-
-def _add_set(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--set",
-        action="extend",
-        nargs="+",
-        default=[],
-        metavar="KEY.SUB=VALUE",
-        help="change one setting, e.g. curriculum.p=0.5; may be repeated",
-    )
 
 
 def _train(args: argparse.Namespace) -> None:
@@ -446,3 +292,13 @@ def _cell(value: Any) -> str:
     if value is None:
         return "-"
     return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+_COMMANDS = {
+    "train": _train,
+    "evaluate": _evaluate,
+    "watch": _watch,
+    "plot": _plot,
+    "compare": _compare,
+    "predictor": _predictor,
+}
