@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import redirect_stderr
 from importlib import import_module
+from io import StringIO
 from typing import Any
 
 import gymnasium as gym
@@ -91,6 +93,30 @@ def object_id(env_id: str) -> str:
     return f"FollowObject/{task.name}Object-v0"
 
 
+def import_task(env_id: str) -> str:
+    """Import the module that may register an id and return the id without the module's name.
+
+    Args:
+        env_id: gymnasium id, with "module:" before it where importing that module registers it.
+
+    Raises:
+        ValueError: the module cannot be imported.
+    """
+    module, _, name = env_id.rpartition(":")
+    if module:
+        try:
+            import_module(module)
+        except (ImportError, TypeError, ValueError) as error:  # a relative name, an empty part
+            raise ValueError(
+                f"{env_id!r} names a module that cannot be imported ({error}); "
+                "is it installed, or its folder on PYTHONPATH?"
+            ) from error
+    elif name not in gym.registry:
+        with redirect_stderr(StringIO()):  # it speaks of other environments' versions
+            import_module("gymnasium_robotics")
+    return name
+
+
 def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: Any) -> Any:
     """A VecEnv of n copies: batched and threaded for our ids, SB3's DummyVecEnv for others.
 
@@ -103,14 +129,7 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
     Raises:
         ValueError: the id is unknown, an option is wrong or `n_envs` is below 1.
     """
-    module, _, name = env_id.rpartition(":")
-    if module and name not in IDS:
-        try:
-            import_module(module)
-        except ImportError as error:
-            raise ValueError(
-                f"{env_id!r} names a module that cannot be imported ({error})."
-            ) from error
+    name = import_task(env_id)
     if name in IDS:
         # Late, because the classes need the ids above.
         from .fetch import FetchVecEnv
@@ -126,10 +145,6 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
 
     if n_envs < 1:
         raise ValueError(f"n_envs must be at least 1, not {n_envs}.")
-    if name not in gym.registry:
-        import gymnasium_robotics  # its ids are there only once it is imported
-
-        gym.register_envs(gymnasium_robotics)
     seed = options.pop("seed", None)
     try:
         venv = DummyVecEnv([lambda: gym.make(env_id, **options) for _ in range(n_envs)])

@@ -181,7 +181,7 @@ def _robot_stage(
     # Those of the policy that is trained further from here on.
     (folder / RESULT).unlink(missing_ok=True)
     (folder / CROSS_TESTS).unlink(missing_ok=True)
-    if run.env_steps >= config.total_timesteps:
+    if model.num_timesteps == 0 and run.env_steps >= config.total_timesteps:
         run.report(
             Trouble(
                 f"{run.env_steps} env steps are gone of {config.total_timesteps}: "

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import redirect_stderr
-from importlib import import_module
-from io import StringIO
-
 import gymnasium as gym
 
 from .envs import IDS
+from .envs.ids import import_task as import_task
 from .envs.tasks import did_you_mean
 
 _GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -69,27 +66,3 @@ def known_id(env_id: str) -> str:
     """
     name = import_task(env_id)
     return name if name in IDS else env_id
-
-
-def import_task(env_id: str) -> str:
-    """Import the module that may register an id and return the id without the module's name.
-
-    Args:
-        env_id: gymnasium id, with "module:" before it where importing that module registers it.
-
-    Raises:
-        ValueError: the module cannot be imported.
-    """
-    module, _, name = env_id.rpartition(":")
-    if module:
-        try:
-            import_module(module)
-        except (ImportError, TypeError, ValueError) as error:  # a relative name, an empty part
-            raise ValueError(
-                f"{env_id!r} names a module that cannot be imported ({error}); "
-                "is it installed, or its folder on PYTHONPATH?"
-            ) from error
-    elif name not in gym.registry:
-        with redirect_stderr(StringIO()):  # it speaks of other environments' versions
-            import_module("gymnasium_robotics")
-    return name
