@@ -11,7 +11,7 @@ RUN ?= runs/pnp-shelf
 .PHONY: train test lint bench test-mujoco-range clean
 
 train: $(INSTALLED)
-	$(BIN)/sb3-follow-object train --env $(ENV) --run $(RUN) --resume-or-start
+	$(BIN)/sb3-follow-object train --env $(ENV) --run $(RUN) --set torch_threads=2 --resume-or-start
 
 test: lint
 	$(BIN)/pytest -q -n 2 --dist loadgroup

@@ -85,7 +85,10 @@ def _add_train(subparsers: Any) -> None:
     )
     train.add_argument("--n-envs", type=int, metavar="N", help="parallel copies of the robot")
     train.add_argument(
-        "--threads", type=int, metavar="N", help="threads of the simulation and of PyTorch"
+        "--threads",
+        type=int,
+        metavar="N",
+        help="threads of the simulation and of gradient steps",
     )
     again = train.add_mutually_exclusive_group()
     again.add_argument("--resume", action="store_true", help="go on with the run in the folder")

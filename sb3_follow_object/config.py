@@ -45,7 +45,7 @@ _CALLBACK_NAMES = {"every": "test_every", "n_episodes": "n_test_episodes", "stor
 
 # What the run itself decides, or what YAML cannot hold.
 _NOT_SETTINGS = {"self", "env", "env_id", "seed", "settings", "method", "imagine", "algorithm"}
-_NOT_SETTINGS |= {"module"}
+_NOT_SETTINGS |= {"module", "update_threads"}
 _NOT_SETTINGS |= {
     "model",
     "object_networks",

@@ -104,7 +104,7 @@ def train(
             remove_half_written(folder)
         else:
             check_empty(folder)
-        th.set_num_threads(config.torch_threads)
+        th.set_num_threads(1)  # nothing but the robot's gradient steps gains from more
         stop = stack.enter_context(StopSignals())
         run = FollowObject(
             config.env_id,
@@ -161,6 +161,7 @@ def _robot_stage(
 
     run.report(f"the robot of {config.env_id} learns")
     model = run.prepare()
+    model.update_threads = config.torch_threads
     eval_env = evaluation_env(config.env_id, n_threads=run.settings["n_threads"])
     evaluation = OriginalGoalEvalCallback(
         eval_env,

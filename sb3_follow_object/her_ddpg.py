@@ -25,8 +25,8 @@ from .device_replay import device_replay_of
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .moments import InputMoments
 from .policies import HerPolicy
-from .ranges import check_value
-from .tensors import matmul_at
+from .ranges import check_positive, check_value
+from .tensors import matmul_at, threads_at
 from .updates import COLUMNS, Updates
 
 SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
@@ -79,6 +79,7 @@ class HerDDPG(DDPG):
             {"name": "rnd"} or {"name": "sldr"} (or a subclass of `AuxiliaryReward` as the name),
             with the keyword arguments of the reward's class and "weight", 1 by default, of its
             critic. Its targets have bounds of their own; `hindsight_bound` does not touch them.
+        update_threads: PyTorch's threads in gradient steps; None, as many as it has otherwise.
         replay_on_device: keep a copy of the replay buffer on the learner's device and draw, relabel
             and reward there, so that no batch is copied. None: on CUDA, where the buffer's settings
             and the environment's reward allow it (`DeviceReplay`). True: also on the CPU, and an
@@ -122,6 +123,7 @@ class HerDDPG(DDPG):
         average_decay: float = 0.0,
         matmul_precision: str = "highest",
         auxiliary: dict[str, Any] | None = None,
+        update_threads: int | None = None,
         replay_on_device: bool | None = None,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -144,6 +146,8 @@ class HerDDPG(DDPG):
             raise ValueError(
                 f"matmul_precision is {matmul_precision!r}; {', '.join(_PRECISIONS)} exist"
             )
+        if update_threads is not None:
+            check_positive(update_threads=update_threads)
         if replay_on_device not in (None, False, True):
             raise ValueError(f"replay_on_device is {replay_on_device!r}; give true, false or none")
         for name, value in (("gamma", gamma), ("tau", tau), ("batch_size", batch_size)):
@@ -179,6 +183,7 @@ class HerDDPG(DDPG):
         self.target_update_interval = target_update_interval
         self.average_decay = average_decay
         self.matmul_precision = matmul_precision
+        self.update_threads = update_threads
         self.auxiliary = auxiliary
         self.auxiliary_critic: AuxiliaryCritic | None = None
         self.replay_on_device = replay_on_device
@@ -338,7 +343,7 @@ class HerDDPG(DDPG):
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Take gradient steps; several batches are drawn from the buffer in one call."""
-        with matmul_at(self.matmul_precision):
+        with matmul_at(self.matmul_precision), threads_at(self.update_threads):
             self._train(gradient_steps, batch_size)
 
     def _train(self, gradient_steps: int, batch_size: int) -> None:

@@ -17,6 +17,7 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
 from .checkpoint import load_tree, save_tree
+from .layer_norm import LayerNorm
 
 # Activation functions that a policy's file may name.
 _ACTIVATIONS: dict[str, type[nn.Module]] = {
@@ -62,7 +63,7 @@ class LayerNormCritic(ContinuousCritic):
             for layer in self.q_networks[idx]:  # type: ignore[attr-defined]
                 layers.append(layer)
                 if isinstance(layer, nn.Linear) and layer.out_features > 1:
-                    layers.append(nn.LayerNorm(layer.out_features))
+                    layers.append(LayerNorm(layer.out_features))
             q_net = nn.Sequential(*layers)
             self.add_module(f"qf{idx}", q_net)
             self.q_networks[idx] = q_net

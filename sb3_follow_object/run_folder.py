@@ -60,7 +60,7 @@ class RunConfig:
         checkpoint_minutes: wall time between two checkpoints, > 0; does not change the result.
         keep_checkpoints: how many of the last checkpoints are kept, >= 1.
         keep_last_checkpoint: whether a finished run keeps one, to be given more steps later.
-        torch_threads: of PyTorch; the last bits of a result may depend on it.
+        torch_threads: of PyTorch in the robot's gradient steps, >= 1; all else takes one.
         module: that registers the task when it is imported; None for the package's own tasks and
             those that gymnasium knows by itself.
     """

@@ -19,6 +19,17 @@ def matmul_at(precision: str) -> Iterator[None]:
         th.set_float32_matmul_precision(earlier)
 
 
+@contextmanager
+def threads_at(n: int | None) -> Iterator[None]:
+    """Let PyTorch use n threads for a while; with None, as many as it does already."""
+    earlier = th.get_num_threads()
+    th.set_num_threads(earlier if n is None else n)
+    try:
+        yield
+    finally:
+        th.set_num_threads(earlier)
+
+
 def lowest(q_values: list[th.Tensor]) -> th.Tensor:
     """Elementwise minimum over critics (n, 1)."""
     return q_values[0] if len(q_values) == 1 else th.stack(q_values).amin(dim=0)
