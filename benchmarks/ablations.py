@@ -22,7 +22,7 @@ from sb3_follow_object.config import run_config
 OUT = Path(__file__).with_name("ablations.csv")
 # What does not change what is learned, or is a column of its own.
 LIMITS = {"total_timesteps", "settings.n_threads", "seed", "checkpoint_minutes"}
-LIMITS |= {"keep_checkpoints", "keep_last_checkpoint"}
+LIMITS |= {"keep_checkpoints", "keep_last_checkpoint", "torch_threads"}
 
 
 def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -51,8 +51,10 @@ def difference(config: dict[str, Any]) -> str:
 def read_row(run: Path) -> dict[str, Any]:
     """Return a run's row."""
     config = json.loads((run / "config.json").read_text())
-    with open(run / "evaluations.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = []
+    if (run / "evaluations.csv").exists():  # not before the first validation
+        with open(run / "evaluations.csv", newline="") as file:
+            rows = list(csv.DictReader(file))
 
     def first(column: str, value: float) -> str:
         hits = (row["env_steps"] for row in rows if row[column] and float(row[column]) >= value)

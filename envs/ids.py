@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from contextlib import redirect_stderr
 from importlib import import_module
 from io import StringIO
@@ -137,9 +138,10 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
 
         face = ObjectVecEnv if IDS[name][1] else FetchVecEnv
         try:
-            return face(name, n_envs, n_threads, **options)
+            inspect.signature(face).bind(name, n_envs, n_threads, **options)
         except TypeError as error:
             raise ValueError(f"{env_id!r} cannot be made: {error}") from error
+        return face(name, n_envs, n_threads, **options)
 
     from stable_baselines3.common.vec_env import DummyVecEnv
 

@@ -14,6 +14,7 @@ from .goal_predictor import GoalPredictor
 from .her_ddpg import HerDDPG
 from .keywords import check_keywords
 from .object_networks import ObjectNetworks
+from .ranges import check_positive
 
 _COUNTS = ("n_envs", "object_n_envs", "object_timesteps", "test_every", "n_test_episodes")
 _OF_RUN = {"env", "seed", "_init_setup_model"}  # what the run itself gives its algorithms
@@ -25,9 +26,7 @@ def check_settings(settings: Mapping[str, Any]) -> None:
     Args:
         settings: `FollowObject`'s.
     """
-    for name in _COUNTS:
-        if settings[name] < 1:
-            raise ValueError(f"{name} is {settings[name]}; it must be at least 1")
+    check_positive(**{name: settings[name] for name in _COUNTS})
     if settings["n_paths"] < 2:
         raise ValueError(f"n_paths is {settings['n_paths']}; it must be at least 2")
     for name, function, hidden in (

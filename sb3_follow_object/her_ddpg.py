@@ -138,8 +138,7 @@ class HerDDPG(DDPG):
             raise ValueError(f"noise_std ({noise_std}) and action_l2 ({action_l2}) must be >= 0")
         if not (target_clip is None or target_clip == "auto" or _is_interval(target_clip)):
             raise ValueError(f'target_clip is {target_clip!r}; give (low, high), "auto" or None')
-        if target_update_interval < 1:
-            raise ValueError(f"target_update_interval is {target_update_interval}; must be >= 1")
+        check_positive(target_update_interval=target_update_interval)
         if not 0.0 <= average_decay < 1.0:
             raise ValueError(f"average_decay is {average_decay}; it must lie in [0, 1)")
         if matmul_precision not in _PRECISIONS:

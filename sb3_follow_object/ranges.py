@@ -89,4 +89,4 @@ def check_positive(**values: int) -> None:
     """Raise a ValueError for a count below 1."""
     for name, value in values.items():
         if value < 1:
-            raise ValueError(f"{name} must be >= 1, got {value!r}.")
+            raise ValueError(f"{name} is {value!r}; it must be at least 1")

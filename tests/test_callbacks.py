@@ -233,7 +233,10 @@ def test_the_curriculum_callback_resumes() -> None:
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"n_episodes": 0}, "n_episodes must be >= 1"), ({"every": 0}, "every must be >= 1")],
+    [
+        ({"n_episodes": 0}, "n_episodes is 0; it must be at least 1"),
+        ({"every": 0}, "every is 0; it must be at least 1"),
+    ],
 )
 def test_bad_counts_are_refused(options: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
