@@ -25,14 +25,16 @@ bench: $(INSTALLED)
 	$(BIN)/pip install -c constraints.txt -e '.[bench]' --no-build-isolation
 	$(BIN)/python benchmarks/speed.py
 
-# mypy reads no setuptools package-dir, so it is shown the package in the shape that is installed.
+# mypy and import-linter read no setuptools package-dir, so they are shown the package in the shape
+# that is installed.
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	@rm -rf build/mypy && mkdir -p build/mypy/sb3_follow_object
-	@ln -s $(wildcard $(CURDIR)/sb3_follow_object/*) $(CURDIR)/envs $(CURDIR)/zoo_configs \
-		build/mypy/sb3_follow_object/
-	MYPYPATH=build/mypy $(BIN)/mypy -p sb3_follow_object
+	@rm -rf build/package && mkdir -p build/package
+	@cp -r sb3_follow_object build/package/
+	@cp -r envs zoo_configs build/package/sb3_follow_object/
+	MYPYPATH=build/package $(BIN)/mypy -p sb3_follow_object
+	cd build/package && $(abspath $(BIN))/lint-imports --no-cache --config $(CURDIR)/pyproject.toml
 
 # torch goes first and by its pin: a range would let pip fetch a newer build with CUDA.
 $(INSTALLED): pyproject.toml constraints.txt

@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from sb3_follow_object.config import run_config
+from sb3_follow_object.settings.presets import run_config
 
 OUT = Path(__file__).with_name("ablations.csv")
 # What does not change what is learned, or is a column of its own.

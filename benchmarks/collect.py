@@ -19,10 +19,10 @@ from itertools import groupby
 from pathlib import Path
 from statistics import median
 
-from sb3_follow_object.cross import CROSS_TESTS
-from sb3_follow_object.figures import FINAL_SUCCESS, draw_results
-from sb3_follow_object.plots import draw_curves
-from sb3_follow_object.results import read_results, write_tables
+from sb3_follow_object.comparison.cross import CROSS_TESTS
+from sb3_follow_object.comparison.figures import FINAL_SUCCESS, draw_results
+from sb3_follow_object.comparison.plots import draw_curves
+from sb3_follow_object.comparison.results import read_results, write_tables
 
 RESULTS = Path(__file__).parent / "results"
 README = Path(__file__).parents[1] / "README.md"

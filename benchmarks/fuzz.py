@@ -30,12 +30,13 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.td3.policies import Actor
 
-from sb3_follow_object.checkpoint import load_tree, save_tree
-from sb3_follow_object.config import load_config, preset_file, run_config
-from sb3_follow_object.goal_predictor import GoalPredictor
-from sb3_follow_object.policies import NormalizedGoalExtractor, load_actor, save_actor
-from sb3_follow_object.predictor_files import FACTS_FILE, TENSORS_FILE
-from sb3_follow_object.run_folder import CONFIG
+from sb3_follow_object.common.array_trees import load_tree, save_tree
+from sb3_follow_object.ddpg.actor_files import load_actor, save_actor
+from sb3_follow_object.ddpg.policies import NormalizedGoalExtractor
+from sb3_follow_object.imagination.goal_predictor import GoalPredictor
+from sb3_follow_object.imagination.predictor_files import FACTS_FILE, TENSORS_FILE
+from sb3_follow_object.runs.run_folder import CONFIG
+from sb3_follow_object.settings.presets import load_config, preset_file, run_config
 
 TASK = "FollowObject/PushSideGap-v0"
 SECONDS = 20  # a load may take on a busy machine

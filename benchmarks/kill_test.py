@@ -38,7 +38,7 @@ KINDS = (*PARTS, WRITING, ANYWHERE)
 CODE = """
 import sys, tiny_runs as runs
 from pathlib import Path
-from sb3_follow_object.experiment import train
+from sb3_follow_object.runs.experiment import train
 folder = Path(sys.argv[1])
 say = lambda sentence: print(sentence, flush=True)
 train(runs.config(), folder, resume=(folder / "config.json").exists(), report=say)

@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 
 from sb3_follow_object import GoalPredictor
-from sb3_follow_object.config import load_config
-from sb3_follow_object.curriculum import Curriculum
+from sb3_follow_object.callbacks.rollout import run_episodes
+from sb3_follow_object.common.seeds import stream_seed
+from sb3_follow_object.ddpg.actor_files import load_actor
 from sb3_follow_object.envs import make_vec
-from sb3_follow_object.experiment import POLICY
-from sb3_follow_object.policies import load_actor
-from sb3_follow_object.rollout import run_episodes
-from sb3_follow_object.run_folder import PREDICTOR
-from sb3_follow_object.seeds import stream_seed
-from sb3_follow_object.wrappers import ImaginedGoalVecEnv
+from sb3_follow_object.imagination.curriculum import Curriculum
+from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
+from sb3_follow_object.runs.object_stage_files import PREDICTOR
+from sb3_follow_object.runs.run_folder import POLICY
+from sb3_follow_object.settings.presets import load_config
 
 
 def main() -> None:

@@ -22,8 +22,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from sb3_follow_object.experiment import RunConfig, train
-from sb3_follow_object.files import atomic_write
+from sb3_follow_object.common.files import atomic_write
+from sb3_follow_object.runs.experiment import train
+from sb3_follow_object.settings.run_config import RunConfig
 
 COLUMNS = ("seconds", "env_steps", "resident_mb", "open_files", "threads")
 LABELS = {"resident_mb": "resident memory (MB)", "open_files": "open files", "threads": "threads"}

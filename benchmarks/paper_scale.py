@@ -25,15 +25,16 @@ from typing import Any
 import gymnasium as gym
 import torch as th
 
-from sb3_follow_object.callbacks import CurriculumCallback
-from sb3_follow_object.config import parse_override, run_config
+from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
+from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
+from sb3_follow_object.common.files import atomic_write
+from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs.batch import BatchedSimulation
-from sb3_follow_object.eval_callback import OriginalGoalEvalCallback
-from sb3_follow_object.experiment import CONFIG, RESULT, train
-from sb3_follow_object.files import atomic_write
-from sb3_follow_object.her_ddpg import HerDDPG
-from sb3_follow_object.object_stage import ObjectStage
-from sb3_follow_object.run_callbacks import CheckpointCallback
+from sb3_follow_object.object_stage.stage import ObjectStage
+from sb3_follow_object.runs.experiment import train
+from sb3_follow_object.runs.run_callbacks import CheckpointCallback
+from sb3_follow_object.runs.run_folder import CONFIG, RESULT
+from sb3_follow_object.settings.presets import parse_override, run_config
 
 TRAINING_STEPS, UPDATES, BATCH = 9_500_000, 200_000, 4_864
 COMMAND = shlex.join(["python", "benchmarks/paper_scale.py", *sys.argv[1:]])

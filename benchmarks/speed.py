@@ -33,11 +33,11 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 import sb3_follow_object
-from sb3_follow_object.config import preset_file, read_yaml
+from sb3_follow_object.common.files import atomic_write
+from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import make_vec
-from sb3_follow_object.files import atomic_write
-from sb3_follow_object.her_ddpg import HerDDPG
-from sb3_follow_object.her_replay_buffer import FollowObjectReplayBuffer
+from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
+from sb3_follow_object.settings.presets import preset_file, read_yaml
 
 HERE = Path(__file__).parent
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -7,13 +7,16 @@ Stable-Baselines3, are loaded when first used.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .ids import IDS, make_vec, object_id, physics_id, register_envs, register_task
-from .tasks import TASKS, Box, Height, Region, Task
+from .registration import register_envs, register_task
+from .task_table import IDS, TASKS, object_id
+from .tasks import Box, Height, Region, Task
 
 if TYPE_CHECKING:
     from .fetch import FetchEnv as FetchEnv
     from .fetch import FetchVecEnv as FetchVecEnv
     from .fetch import object_state as object_state
+    from .make import make_vec as make_vec
+    from .make import physics_id as physics_id
     from .object_locomotion import ObjectEnv as ObjectEnv
     from .object_locomotion import ObjectVecEnv as ObjectVecEnv
     from .scene import object_only as object_only
@@ -23,8 +26,10 @@ _HOME = {
     "FetchVecEnv": "fetch",
     "ObjectEnv": "object_locomotion",
     "ObjectVecEnv": "object_locomotion",
+    "make_vec": "make",
     "object_only": "scene",
     "object_state": "fetch",
+    "physics_id": "make",
 }
 
 __all__ = [
@@ -34,9 +39,7 @@ __all__ = [
     "Height",
     "Region",
     "Task",
-    "make_vec",
     "object_id",
-    "physics_id",
     "register_envs",
     "register_task",
     *_HOME,

@@ -9,9 +9,9 @@ import numpy as np
 
 from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles, rotate
 from .faces import BatchVecEnv, RewardType, SingleEnv
-from .ids import task_of
 from .scene import FINGER_JOINTS, GRIP_SITE, Scene, fetch_scene
-from .tasks import Task, find_task
+from .task_table import find_task, task_of
+from .tasks import Task
 
 # Added to the gripper's own quaternion each step, which turns it to point down.
 _DOWNWARD = np.array([1.0, 0.0, 1.0, 0.0])

@@ -8,9 +8,9 @@ import numpy as np
 
 from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles
 from .faces import BatchVecEnv, RewardType, SingleEnv
-from .ids import task_of
 from .scene import object_scene
-from .tasks import Task, find_task
+from .task_table import find_task, task_of
+from .tasks import Task
 
 
 class ObjectSimulation(BatchedSimulation):

@@ -1,8 +1,7 @@
-"""The tasks, one row of data each (section 4 of the paper, Experiments). All lengths in metres."""
+"""What a task is: obstacles, and where object and goal are drawn. All lengths in metres."""
 
 from __future__ import annotations
 
-import difflib
 import re
 from dataclasses import dataclass
 from typing import Literal
@@ -165,96 +164,3 @@ def reference_point(region: Region, landmarks: Landmarks) -> np.ndarray:
     """The (x, y) that a region's offsets start from, shape (2,)."""
     point = landmarks.gripper if region.reference == "gripper" else landmarks.table
     return np.array(point[:2])
-
-
-def _wall(x: float, y: float, half_x: float) -> Box:
-    """A low wall of the pushing tasks: 0.1 m high, 0.025 m thick, standing on the table."""
-    return Box((x, y, 0.25), (half_x, 0.0125, 0.05))
-
-
-_AROUND_GRIPPER = Region("gripper", (-0.15, -0.15), (0.15, 0.15))
-_WHOLE_TABLE = Region("table", (-0.225, -0.325), (0.225, 0.325))
-_NEAR_SIDE = Region("gripper", (-0.15, -0.15), (0.15, 0.05))
-_BEFORE_BOTH_WALLS = Region("gripper", (-0.15, -0.25), (0.15, -0.15))
-_FAR_SIDE = Region("gripper", (-0.15, 0.125), (0.15, 0.25))
-_ON_TABLE_OR_ABOVE = Height(0.0, 0.45, chance=0.5)
-_SIDE_GAP_WALL = _wall(0.0, 0.075, 0.175)
-
-_ROWS = (
-    Task("PnPSimpleV1", _AROUND_GRIPPER, _AROUND_GRIPPER, _ON_TABLE_OR_ABOVE),
-    Task("PnPSimpleV2", _WHOLE_TABLE, _WHOLE_TABLE, Height(0.05, 0.45)),
-    Task(
-        "PushSideGap",
-        _NEAR_SIDE,
-        _FAR_SIDE,
-        obstacles=(_SIDE_GAP_WALL,),
-        blocked_gripper=True,
-    ),
-    Task(
-        "PushMiddleGap",
-        _NEAR_SIDE,
-        _FAR_SIDE,
-        obstacles=(_wall(-0.14375, 0.075, 0.10625), _wall(0.14375, 0.075, 0.10625)),
-        blocked_gripper=True,
-    ),
-    Task(
-        "PushDoubleObstacles",
-        _BEFORE_BOTH_WALLS,
-        _FAR_SIDE,
-        horizon=80,
-        obstacles=(
-            _SIDE_GAP_WALL,
-            _wall(-0.14375, -0.125, 0.10625),
-            _wall(0.14375, -0.125, 0.10625),
-        ),
-        blocked_gripper=True,
-    ),
-    Task(
-        "PnPObstacle",
-        _NEAR_SIDE,
-        _FAR_SIDE,
-        _ON_TABLE_OR_ABOVE,
-        obstacles=(Box((0.0, 0.075, 0.30), (0.25, 0.0125, 0.10), friction=(1.0, 1.0, 1.0)),),
-    ),
-    Task(
-        "PnPShelf",
-        _NEAR_SIDE,
-        _FAR_SIDE,
-        Height(0.20, 0.20),
-        obstacles=(Box((0.0, 0.2125, 0.30), (0.25, 0.1375, 0.10), condim=3),),
-    ),
-    Task(
-        "PnPInsertion",
-        _AROUND_GRIPPER,
-        _AROUND_GRIPPER,
-        tube=(
-            Box((0.05125, 0.0, 0.05), (0.02375, 0.075, 0.05)),
-            Box((-0.05125, 0.0, 0.05), (0.02375, 0.075, 0.05)),
-            Box((0.0, 0.05125, 0.05), (0.0275, 0.02375, 0.05)),
-            Box((0.0, -0.05125, 0.05), (0.0275, 0.02375, 0.05)),
-        ),
-        min_goal_distance=0.15,
-    ),
-)
-
-TASKS: dict[str, Task] = {row.name: row for row in _ROWS}
-
-
-def find_task(task: str | Task) -> Task:
-    """The row of this name; a row is handed through.
-
-    Raises:
-        ValueError: no task has this name.
-    """
-    if isinstance(task, Task):
-        return task
-    if task not in TASKS:
-        raise ValueError(f"Unknown task {task!r}{did_you_mean(task, TASKS)}.")
-    return TASKS[task]
-
-
-def did_you_mean(word: str, known: object) -> str:
-    """The end of a sentence about an unknown name: the nearest known one, else all of them."""
-    names = [str(name) for name in known]  # type: ignore[attr-defined]
-    near = difflib.get_close_matches(str(word), names, n=1, cutoff=0.4)
-    return f"; did you mean {near[0]!r}?" if near else f"; known are {', '.join(names)}"

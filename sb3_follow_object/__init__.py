@@ -7,40 +7,69 @@ loaded when first used: whoever wants the environments alone does not wait for t
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .envs import register_envs
-
-register_envs()
+from .common.old_names import keep_old_names
+from .common.providers import provide
+from .envs import register_envs, register_task
 
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .auxiliary import AuxiliaryReward as AuxiliaryReward
-    from .callbacks import CurriculumCallback as CurriculumCallback
-    from .curriculum import Curriculum as Curriculum
-    from .eval_callback import OriginalGoalEvalCallback as OriginalGoalEvalCallback
-    from .follow_object import FollowObject as FollowObject
-    from .goal_predictor import GoalPredictor as GoalPredictor
-    from .her_ddpg import HerDDPG as HerDDPG
-    from .her_replay_buffer import FollowObjectReplayBuffer as FollowObjectReplayBuffer
-    from .object_networks import ObjectNetworks as ObjectNetworks
-    from .wrappers import ImaginedGoalVecEnv as ImaginedGoalVecEnv
-    from .wrappers import ImaginedGoalWrapper as ImaginedGoalWrapper
+    from .callbacks.curriculum_callback import CurriculumCallback as CurriculumCallback
+    from .callbacks.eval_callback import OriginalGoalEvalCallback as OriginalGoalEvalCallback
+    from .ddpg.actor_files import load_actor as load_actor
+    from .ddpg.actor_files import save_actor as save_actor
+    from .ddpg.auxiliary import AuxiliaryReward as AuxiliaryReward
+    from .ddpg.her_ddpg import HerDDPG as HerDDPG
+    from .ddpg.policies import HerPolicy as HerPolicy
+    from .envs import make_vec as make_vec
+    from .follow_object.follow_object import FollowObject as FollowObject
+    from .imagination.curriculum import Curriculum as Curriculum
+    from .imagination.goal_predictor import GoalPredictor as GoalPredictor
+    from .imagination.vec_env import ImaginedGoalVecEnv as ImaginedGoalVecEnv
+    from .imagination.wrapper import ImaginedGoalWrapper as ImaginedGoalWrapper
+    from .object_stage.networks import ObjectNetworks as ObjectNetworks
+    from .replay.her_replay_buffer import FollowObjectReplayBuffer as FollowObjectReplayBuffer
+    from .runs.experiment import evaluate as evaluate
+    from .runs.experiment import train as train
+    from .runs.predictor_cache import get_object_networks as get_object_networks
+    from .runs.predictor_cache import get_predictor as get_predictor
+    from .settings.presets import preset_file as preset_file
+    from .settings.presets import run_config as run_config
+    from .settings.run_config import RunConfig as RunConfig
 
 _HOME = {
-    "AuxiliaryReward": "auxiliary",
-    "Curriculum": "curriculum",
-    "CurriculumCallback": "callbacks",
-    "FollowObject": "follow_object",
-    "FollowObjectReplayBuffer": "her_replay_buffer",
-    "GoalPredictor": "goal_predictor",
-    "HerDDPG": "her_ddpg",
-    "ImaginedGoalVecEnv": "wrappers",
-    "ImaginedGoalWrapper": "wrappers",
-    "ObjectNetworks": "object_networks",
-    "OriginalGoalEvalCallback": "eval_callback",
+    "AuxiliaryReward": "ddpg.auxiliary",
+    "Curriculum": "imagination.curriculum",
+    "CurriculumCallback": "callbacks.curriculum_callback",
+    "FollowObject": "follow_object.follow_object",
+    "FollowObjectReplayBuffer": "replay.her_replay_buffer",
+    "GoalPredictor": "imagination.goal_predictor",
+    "HerDDPG": "ddpg.her_ddpg",
+    "HerPolicy": "ddpg.policies",
+    "ImaginedGoalVecEnv": "imagination.vec_env",
+    "ImaginedGoalWrapper": "imagination.wrapper",
+    "ObjectNetworks": "object_stage.networks",
+    "OriginalGoalEvalCallback": "callbacks.eval_callback",
+    "RunConfig": "settings.run_config",
+    "evaluate": "runs.experiment",
+    "get_object_networks": "runs.predictor_cache",
+    "get_predictor": "runs.predictor_cache",
+    "load_actor": "ddpg.actor_files",
+    "make_vec": "envs.make",
+    "preset_file": "settings.presets",
+    "run_config": "settings.presets",
+    "save_actor": "ddpg.actor_files",
+    "train": "runs.experiment",
 }
 
-__all__ = [*_HOME, "register_envs"]
+__all__ = [*_HOME, "register_envs", "register_task"]
+
+register_envs()
+keep_old_names()
+provide("predictor", "auto", f"{__name__}.runs.predictor_cache:get_predictor")
+provide("object networks", "auto", f"{__name__}.runs.predictor_cache:get_object_networks")
+provide("auxiliary reward", "rnd", f"{__name__}.ddpg.rnd:RndReward")
+provide("auxiliary reward", "sldr", f"{__name__}.object_stage.sldr:SldrReward")
 
 
 def __getattr__(name: str) -> Any:

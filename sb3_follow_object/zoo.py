@@ -12,9 +12,9 @@ from typing import Any
 
 from stable_baselines3.common.buffers import DictReplayBuffer
 
-from .config import preset_file
-from .extras import need
-from .her_ddpg import HerDDPG
+from .common.extras import need
+from .ddpg.her_ddpg import HerDDPG
+from .settings.presets import preset_file
 
 ALGORITHM = "her_ddpg"
 COMMANDS = ("train", "enjoy")

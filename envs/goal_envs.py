@@ -1,0 +1,68 @@
+"""Which environment an id means, and whether a robot can pursue goals there."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+
+from ..common.suggestions import did_you_mean
+from .registration import import_task
+from .task_table import IDS
+
+_GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+def check_task(env_id: str) -> str:
+    """Return an id without a module's name, if a robot can pursue goals there.
+
+    Raises:
+        ValueError: gymnasium does not know the id, or the environment has no goals or no horizon
+            or does not tell whether a goal is reached.
+    """
+    name = import_task(env_id)
+    if name not in gym.registry:
+        near = did_you_mean(name, [*IDS, *gym.registry])
+        raise ValueError(f"there is no environment {env_id!r}{near}")
+    if name in IDS:
+        return name
+    try:
+        env = gym.make(name)
+    except Exception as error:  # an environment of somebody's may raise anything
+        raise ValueError(f"{env_id!r} cannot be made: {error or type(error).__name__}") from error
+    try:
+        missing = set(_GOAL_KEYS) - set(getattr(env.observation_space, "spaces", {}))
+        if missing:
+            raise ValueError(
+                f"{env_id!r} has no goals: its observations lack {', '.join(sorted(missing))}"
+            )
+        if env.spec is None or env.spec.max_episode_steps is None:
+            raise ValueError(f"{env_id!r} does not say how long its episodes are")
+        if _hides_success(env):
+            raise ValueError(f"{env_id!r} does not tell in its info whether the goal is reached")
+    finally:
+        env.close()
+    return name
+
+
+def _hides_success(env: gym.Env) -> bool:
+    """Whether a whole episode's info never says `is_success`."""
+    try:
+        env.reset(seed=0)
+        over = False
+        while not over:
+            _, _, terminated, truncated, info = env.step(env.action_space.sample())
+            if "is_success" in info:
+                return False
+            over = terminated or truncated
+        return True
+    except Exception:  # an environment of somebody's may raise anything; training will tell it
+        return False
+
+
+def known_id(env_id: str) -> str:
+    """Return an id as the package's tables have it: without a module, if it is one of ours.
+
+    Raises:
+        ValueError: the module that it names cannot be imported.
+    """
+    name = import_task(env_id)
+    return name if name in IDS else env_id

@@ -1,0 +1,227 @@
+"""Callback that tests h_max and advances k_max."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from ..envs import IDS, make_vec
+from ..imagination.curriculum import Curriculum
+from ..imagination.vec_env import ImaginedGoalVecEnv, imagination_of
+from ..settings.ranges import check_positive
+from .rollout import Observation, OnStep, noise_free, run_episodes
+
+
+class CurriculumCallback(BaseCallback):
+    """Test the policy on h_max without noise and advance k_max (paper, Algorithm 1).
+
+    A test is due after every ``every`` cycles. A cycle is a rollout that has finished at least one
+    episode; rollouts of a few steps add up to one. Nothing is tested once the curriculum is
+    finished. Records curriculum/k_max, curriculum/test_success and curriculum/test_steps.
+
+    The model carries the curriculum's state as ``model.curriculum_state``, which SB3 saves with it:
+    training that goes on from a loaded model goes on at its k_max.
+
+    Args:
+        test_env: ImaginedGoalVecEnv with mode="test", sharing the training's curriculum; None
+            makes as many copies of the training's environment when training starts.
+        n_episodes: episodes of a test, >= 1; None, one of every copy.
+        every: cycles between tests, >= 1.
+        store: whether to put the tests' transitions into the model's replay buffer. It is done
+            where that keeps the buffer's episodes whole: with as many copies as the training has,
+            and when no training episode is half-way.
+
+    Attributes:
+        test_steps: environment steps spent in tests so far, all copies counted; they are part of
+            the model's num_timesteps.
+
+    Raises:
+        ValueError: an argument is outside its range, test_env does not show h_max, or training
+            starts in an environment that imagines no goals, with a test_env of another curriculum,
+            or without one where none can be copied.
+    """
+
+    def __init__(
+        self,
+        test_env: ImaginedGoalVecEnv | None = None,
+        n_episodes: int | None = None,
+        every: int = 1,
+        store: bool = True,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        is_test = isinstance(test_env, ImaginedGoalVecEnv) and test_env.mode == "test"
+        if test_env is not None and not is_test:
+            raise ValueError("test_env must be an ImaginedGoalVecEnv with mode='test'.")
+        check_positive(n_episodes=1 if n_episodes is None else n_episodes, every=every)
+        self._test_env = test_env
+        self.n_episodes = n_episodes
+        self.every = every
+        self.store = store
+        self.test_steps = 0
+        self._cycles = 0
+        self._episode_ended = False
+        self._started = False
+
+    @property
+    def test_env(self) -> ImaginedGoalVecEnv:
+        """The environment that tests run in; one of the callback's own exists once training has."""
+        if self._test_env is None:
+            raise RuntimeError("the test environment is made when training starts")
+        return self._test_env
+
+    @property
+    def curriculum(self) -> Curriculum:
+        """The curriculum that the tests advance."""
+        return self.test_env.curriculum
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed training needs (JSON types); the curriculum has its own state."""
+        return {
+            "test_steps": self.test_steps,
+            "cycles": self._cycles,
+            "episode_ended": self._episode_ended,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``."""
+        self.test_steps = int(state["test_steps"])
+        self._cycles = int(state["cycles"])
+        self._episode_ended = bool(state["episode_ended"])
+
+    def _on_training_start(self) -> None:
+        if self._test_env is None:
+            self._test_env = _test_copies(self.training_env)
+        else:
+            _check_curriculum(self.training_env, self.curriculum)
+        if self._started and self.model.num_timesteps == 0:
+            self.test_steps = 0  # counted anew, as SB3 does its steps unless told otherwise
+        if not self._started and hasattr(self.model, "curriculum_state"):
+            self.curriculum.load_state_dict(self.model.curriculum_state)
+        self._started = True
+        self._share_curriculum()
+
+    def _on_step(self) -> bool:
+        self._episode_ended |= bool(np.any(self.locals["dones"]))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self._cycles += self._episode_ended
+        self._episode_ended = False
+        if self._cycles >= self.every and not self.curriculum.finished:
+            self._cycles = 0
+            self._test()
+        self.logger.record("curriculum/k_max", self.curriculum.k_max)
+        self.logger.record("curriculum/test_steps", self.test_steps)
+
+    def _test(self) -> None:
+        buffer = self._open_buffer()
+        episodes = run_episodes(
+            noise_free(self.model, learning=True),
+            self.test_env,
+            self.n_episodes or self.test_env.num_envs,
+            on_step=None if buffer is None else self._storing(buffer),
+        )
+        if isinstance(buffer, HerReplayBuffer):
+            _close_episodes(buffer)
+        self.test_steps += episodes.env_steps
+        self.model.num_timesteps += episodes.env_steps  # tests cost steps like any others
+        self.logger.record("curriculum/test_success", episodes.success_rate)
+        if self.curriculum.report(episodes.success_rate):
+            self._share_curriculum()
+            if self.verbose:
+                print(
+                    f"k_max {self.curriculum.k_max} of {self.curriculum.n_levels} "
+                    f"after {self.num_timesteps} steps"
+                )
+
+    def _share_curriculum(self) -> None:
+        """Tell the model and the copies of the curriculum inside the training's environments."""
+        state = self.curriculum.state_dict()
+        self.model.curriculum_state = state  # type: ignore[attr-defined]
+        if self.training_env.has_attr("load_curriculum"):
+            self.training_env.env_method("load_curriculum", state)
+
+    def _open_buffer(self) -> Any:
+        """Return the replay buffer if test episodes can go into it now, else None."""
+        buffer = getattr(self.model, "replay_buffer", None)
+        if not self.store or buffer is None or self.test_env.num_envs != buffer.n_envs:
+            return None
+        if isinstance(buffer, HerReplayBuffer) and (buffer._current_ep_start != buffer.pos).any():
+            return None
+        return buffer
+
+    def _storing(self, buffer: Any) -> OnStep:
+        continuous = isinstance(self.model.action_space, spaces.Box)
+
+        def store(
+            obs: Observation,
+            actions: np.ndarray,
+            rewards: np.ndarray,
+            dones: np.ndarray,
+            infos: list[dict[str, Any]],
+            next_obs: Observation,
+        ) -> None:
+            # Buffers of SB3 hold actions scaled to [-1, 1].
+            stored = self.model.policy.scale_action(actions) if continuous else actions
+            buffer.add(obs, next_obs, stored, rewards, dones, infos)
+
+        return store
+
+
+def _test_copies(training_env: VecEnv) -> ImaginedGoalVecEnv:
+    """Make as many copies of the training's environment, which show h_max of its curriculum."""
+    predictor, curriculum = imagination_of(training_env, "CurriculumCallback without a test_env")
+    spec = training_env.get_attr("spec", indices=[0])[0]
+    if spec is None:
+        raise ValueError(
+            "CurriculumCallback cannot copy an environment that gymnasium.make did not make; "
+            "give it a test_env."
+        )
+    options = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
+    if spec.id in IDS:
+        options.pop("task", None)  # the id says it
+        options["reward_type"] = training_env.get_attr("reward_type", indices=[0])[0]
+    venv = make_vec(spec.id, training_env.num_envs, **options)
+    test_env = ImaginedGoalVecEnv(venv, predictor, curriculum, mode="test")
+    ours, theirs = _facts(test_env), _facts(training_env)
+    for name, value in theirs.items():
+        if ours[name] != value:
+            raise ValueError(
+                f"The training's {name} {value} are not those of {spec.id}, {ours[name]}: give "
+                "CurriculumCallback a test_env with the same wrappers."
+            )
+    # NumPy's global stream is the one that SB3 seeds.
+    test_env.seed(int(np.random.randint(2**31 - 1000)))
+    return test_env
+
+
+def _facts(env: VecEnv) -> dict[str, Any]:
+    """Return what wrappers change that a test has to have too."""
+    spaces_of = getattr(env.observation_space, "spaces", {})
+    return {
+        "observations": {key: space.shape for key, space in spaces_of.items()},
+        "actions": env.action_space,
+        "steps an episode": env.get_attr("spec", indices=[0])[0].max_episode_steps,
+    }
+
+
+def _check_curriculum(training_env: VecEnv, curriculum: Curriculum) -> None:
+    """Raise a ValueError unless the training imagines goals by the curriculum of the tests."""
+    theirs = imagination_of(training_env, "CurriculumCallback")[1]
+    # Wrappers of single environments have copies of it, which are told of every change.
+    if is_vecenv_wrapped(training_env, ImaginedGoalVecEnv) and theirs is not curriculum:
+        raise ValueError("test_env must have the Curriculum object that the training has.")
+
+
+def _close_episodes(buffer: HerReplayBuffer) -> None:
+    """End test episodes that were still running, so that training starts its own."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it warns of just what is wanted here
+        buffer.truncate_last_trajectory()

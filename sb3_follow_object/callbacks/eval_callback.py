@@ -1,0 +1,196 @@
+"""Callback that evaluates on original goals and keeps the curve."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped
+
+from ..common.files import atomic_write
+from ..common.seeds import stream_seed
+from ..settings.ranges import check_positive
+from .curriculum_callback import CurriculumCallback
+from .rollout import noise_free, run_episodes
+
+
+class OriginalGoalEvalCallback(BaseCallback):
+    """Evaluate the policy without noise on fresh episodes with original goals.
+
+    Runs at the first end of a rollout after each ``every_steps`` environment steps. Records
+    eval/success_rate, eval/mean_return and eval/env_steps, and appends a row to a CSV file.
+
+    Args:
+        eval_env: vectorised environment that shows the original goals, not in VecNormalize: a
+            model that was trained in one normalises what it sees here too.
+        n_episodes: episodes of an evaluation, >= 1.
+        every_steps: the model's num_timesteps, tests included, between evaluations, >= 1.
+        csv_path: file for the rows; None writes none. A file that holds rows from after the
+            loaded state loses those, so that a resumed run repeats none.
+        curriculum_callback: its tests are counted in env_steps and its k_max is noted.
+        object_steps: steps that the object policy took, counted in env_steps, >= 0.
+        wall_before: seconds that the object stage took, counted in wall_s.
+        seed: of the evaluations' episodes, so that a resumed run is tested on the same; None
+            leaves the environment's own generators running.
+
+    Attributes:
+        success_rate: of the last evaluation, None before the first.
+        n_evaluations: evaluations so far.
+
+    Raises:
+        ValueError: an argument is outside its range, eval_env is in VecNormalize, or the CSV file
+            belongs to another run.
+    """
+
+    COLUMNS = (
+        "env_steps",
+        "train_steps",
+        "test_steps",
+        "object_steps",
+        "wall_s",
+        "success_rate",
+        "mean_return",
+        "episodes",
+        "k_max",
+    )
+
+    def __init__(
+        self,
+        eval_env: VecEnv,
+        n_episodes: int,
+        every_steps: int,
+        csv_path: str | os.PathLike[str] | None = None,
+        curriculum_callback: CurriculumCallback | None = None,
+        object_steps: int = 0,
+        wall_before: float = 0.0,
+        seed: int | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        check_positive(n_episodes=n_episodes, every_steps=every_steps)
+        if object_steps < 0:
+            raise ValueError(f"object_steps must be >= 0, got {object_steps!r}.")
+        if is_vecenv_wrapped(eval_env, VecNormalize):
+            raise ValueError(
+                "eval_env is in VecNormalize; the model's own normalises already: leave it out."
+            )
+        self.eval_env = eval_env
+        self.n_episodes = n_episodes
+        self.every_steps = every_steps
+        self.csv_path = None if csv_path is None else Path(csv_path)
+        self.curriculum_callback = curriculum_callback
+        self.object_steps = object_steps
+        self.success_rate: float | None = None
+        self._rows: list[dict[str, Any]] = []
+        self._last_steps = 0
+        self.n_evaluations = 0
+        self.seed = seed
+        self._resumed = False
+        self._wall_before = wall_before
+        self._started = time.monotonic()
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps so far: training, tests of the curriculum, object policy."""
+        return self.model.num_timesteps + self.object_steps
+
+    @property
+    def _test_steps(self) -> int:
+        callback = self.curriculum_callback
+        return 0 if callback is None else callback.test_steps
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed training needs (JSON types)."""
+        return {
+            "last_steps": self._last_steps,
+            "success_rate": self.success_rate,
+            "n_evaluations": self.n_evaluations,
+            "wall_s": self.wall_s,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``."""
+        self._last_steps = int(state["last_steps"])
+        self.success_rate = state["success_rate"]
+        self.n_evaluations = int(state["n_evaluations"])
+        self._resumed = True
+        self._wall_before = float(state["wall_s"])
+        self._started = time.monotonic()
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds of training so far, those before an interruption included."""
+        return self._wall_before + time.monotonic() - self._started
+
+    def _on_training_start(self) -> None:
+        if self.n_evaluations and not self._resumed and self.model.num_timesteps == 0:
+            self._last_steps = 0  # counted anew, as SB3 does its steps unless told otherwise
+        if self.csv_path is not None:
+            self._rows = self._earlier_rows(self.csv_path)
+            self._write_csv(self.csv_path)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        num_timesteps = self.model.num_timesteps
+        if num_timesteps - self._last_steps < self.every_steps:
+            return
+        self._last_steps = num_timesteps
+        self.n_evaluations += 1
+        if self.seed is not None:
+            self.eval_env.seed(stream_seed(self.seed, f"evaluation {self.n_evaluations}"))
+        episodes = run_episodes(noise_free(self.model), self.eval_env, self.n_episodes)
+        self.success_rate = episodes.success_rate
+        mean_return = float(episodes.returns.mean())
+        self.logger.record("eval/success_rate", self.success_rate)
+        self.logger.record("eval/mean_return", mean_return)
+        self.logger.record("eval/env_steps", self.env_steps)
+        if self.csv_path is None:
+            return
+        callback = self.curriculum_callback
+        values = (
+            self.env_steps,
+            num_timesteps - self._test_steps,
+            self._test_steps,
+            self.object_steps,
+            round(self.wall_s, 1),
+            round(self.success_rate, 4),
+            round(mean_return, 4),
+            self.n_episodes,
+            "" if callback is None else callback.curriculum.k_max,
+        )
+        self._rows.append(dict(zip(self.COLUMNS, values, strict=True)))
+        self._write_csv(self.csv_path)
+
+    def _earlier_rows(self, path: Path) -> list[dict[str, Any]]:
+        """Return the file's rows up to the state that training starts from."""
+        if not path.exists():
+            return []
+        with open(path, newline="") as file:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+        if tuple(reader.fieldnames or ()) != self.COLUMNS:
+            raise ValueError(f"{path} exists and is not a file of evaluations.")
+        if rows and not (self._resumed or self._last_steps):
+            raise ValueError(
+                f"{path} holds another run's evaluations: give another file, or load the state "
+                "that they belong to."
+            )
+
+        def steps(row: dict[str, Any]) -> int:
+            return int(row["train_steps"]) + int(row["test_steps"])
+
+        return [row for row in rows if steps(row) <= self._last_steps]
+
+    def _write_csv(self, path: Path) -> None:
+        text = io.StringIO()
+        writer = csv.DictWriter(text, self.COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self._rows)
+        atomic_write(path, text.getvalue().encode())

@@ -1,0 +1,49 @@
+"""Episodes that a resumed training sees again, in environments that cannot tell their state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+
+class FreshEpisodes(BaseCallback):
+    """Start each rollout with episodes of a seed of its own.
+
+    For environments that cannot tell their state: what they do in a rollout then depends on the
+    steps taken so far and on nothing else, so that a resumed training sees the same episodes.
+    Rollouts that begin in the middle of an episode are left alone.
+
+    Args:
+        seed: gives the seed for a number of steps.
+    """
+
+    def __init__(self, seed: Callable[[int], int]):
+        super().__init__()
+        self.seed = seed
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        assert isinstance(self.model, OffPolicyAlgorithm)
+        if episodes_are_whole(self.model):
+            self.training_env.seed(self.seed(self.model.num_timesteps))
+            self.model._last_obs = self.training_env.reset()  # type: ignore[assignment]
+
+
+def begin_new_episodes(model: OffPolicyAlgorithm) -> None:
+    """Drop the episodes that were running; `learn` then resets the environment."""
+    model._last_obs = None
+    if not episodes_are_whole(model):
+        model.replay_buffer.truncate_last_trajectory()  # type: ignore[union-attr]
+
+
+def episodes_are_whole(model: OffPolicyAlgorithm) -> bool:
+    """Whether no episode in the replay buffer waits for its end."""
+    buffer: Any = model.replay_buffer
+    return not hasattr(buffer, "_current_ep_start") or bool(
+        (buffer._current_ep_start == buffer.pos).all()
+    )

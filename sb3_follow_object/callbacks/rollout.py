@@ -1,0 +1,135 @@
+"""Noise-free episodes in a vectorised environment, for evaluation, curriculum tests and paths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from ..ddpg.her_ddpg import HerDDPG
+
+Observation = dict[str, np.ndarray]
+Policy = Callable[[Observation], np.ndarray]
+OnStep = Callable[
+    [Observation, np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]], Observation], None
+]
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What a batch of finished episodes came to.
+
+    Attributes:
+        success: (n,) bool, `is_success` at the last step of each episode, for the goal shown.
+        returns: (n,) float, undiscounted sum of the rewards.
+        env_steps: steps simulated, all copies counted, episodes that were not needed included.
+    """
+
+    success: np.ndarray
+    returns: np.ndarray
+    env_steps: int
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the episodes that ended on the goal shown."""
+        return float(self.success.mean())
+
+
+def with_terminal_observations(
+    obs: Observation, dones: np.ndarray, infos: list[dict[str, Any]]
+) -> Observation:
+    """Return the observations that the step led to, undoing the automatic reset.
+
+    Args:
+        obs: observation of each copy after the step, of a new episode where `dones`.
+        dones: (n_envs,) bool.
+        infos: one dict a copy, with `terminal_observation` where done.
+    """
+    if not dones.any():
+        return obs
+    obs = {key: value.copy() for key, value in obs.items()}
+    for i in np.flatnonzero(dones):
+        for key, value in infos[i]["terminal_observation"].items():
+            obs[key][i] = value
+    return obs
+
+
+def run_episodes(
+    policy: Policy, venv: VecEnv, n_episodes: int, on_step: OnStep | None = None
+) -> Episodes:
+    """Run `n_episodes` fresh episodes and say how they ended.
+
+    Each copy contributes the same number of episodes (to within one), so that quick failures are
+    not over-represented. Episodes whose info says "diverged" at the end are not counted.
+
+    Args:
+        policy: maps observations, arrays of (n_envs, ...), to actions (n_envs, action_dim).
+        venv: is reset first; its copies reset by themselves afterwards.
+        n_episodes: at least 1.
+        on_step: called after every step with (obs, actions, rewards, dones, infos, next_obs), where
+            next_obs holds the terminal observation of the copies that are done.
+
+    Raises:
+        ValueError: if `n_episodes` is below 1 or an episode ends without saying `is_success`.
+        RuntimeError: more than `n_episodes` episodes diverged.
+    """
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes is {n_episodes}; it must be at least 1")
+    n_envs = venv.num_envs
+    wanted = np.array([(n_episodes + i) // n_envs for i in range(n_envs)])
+    finished = np.zeros(n_envs, dtype=int)
+    returns_so_far = np.zeros(n_envs)
+    success, returns = [], []
+    env_steps = n_diverged = 0
+
+    obs = venv.reset()
+    while (finished < wanted).any():
+        actions = policy(obs)  # type: ignore[arg-type]
+        new_obs, rewards, dones, infos = venv.step(actions)
+        env_steps += n_envs
+        returns_so_far += rewards
+        if on_step is not None:
+            next_obs = with_terminal_observations(new_obs, dones, infos)  # type: ignore[arg-type]
+            on_step(obs, actions, rewards, dones, infos, next_obs)  # type: ignore[arg-type]
+        for i in np.flatnonzero(dones):
+            if "diverged" in infos[i]:
+                n_diverged += 1
+                if n_diverged > n_episodes:
+                    raise RuntimeError(
+                        f"the physics diverged in {n_diverged} episodes of {n_episodes} wanted "
+                        f"(the last: {infos[i]['diverged']})"
+                    )
+            elif finished[i] < wanted[i]:
+                if "is_success" not in infos[i]:
+                    raise ValueError(
+                        "the environment's info has no 'is_success' at the end of an episode; "
+                        "success rates need an environment that reports it"
+                    )
+                success.append(bool(infos[i]["is_success"]))
+                returns.append(returns_so_far[i])
+                finished[i] += 1
+            returns_so_far[i] = 0.0
+        obs = new_obs
+
+    return Episodes(np.array(success), np.array(returns), env_steps)
+
+
+def noise_free(model: BaseAlgorithm, learning: bool = False) -> Policy:
+    """Return the model's deterministic policy on observations as the environments give them.
+
+    Args:
+        model: any algorithm of SB3.
+        learning: of a HerDDPG that averages its actor, the actor that learns instead.
+    """
+    player = model.actor if learning and isinstance(model, HerDDPG) else model
+    normaliser = model.get_vec_normalize_env()
+
+    def policy(obs: Observation) -> np.ndarray:
+        seen = obs if normaliser is None else normaliser.normalize_obs(obs)
+        return player.predict(seen, deterministic=True)[0]
+
+    return policy

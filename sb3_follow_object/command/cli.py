@@ -1,0 +1,311 @@
+"""The command `sb3-follow-object`: train, evaluate, watch, plot, compare, predictor."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .cli_options import CURVE, PROGRAM, USER_ERROR, VIDEO, make_parser
+
+# Nothing heavier here: --help must not wait for torch. The commands import what they use.
+
+if TYPE_CHECKING:
+    from ..settings.run_config import RunConfig
+
+# Settings that only runs with imagined goals read.
+_OF_IMAGINED = (
+    "curriculum",
+    "predictor_fit",
+    "n_paths",
+    "test_every",
+    "n_test_episodes",
+    "store_tests",
+)
+INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return its exit status: 0, 2 on bad input, 130 on Ctrl-C.
+
+    Args:
+        argv: the arguments after the program's name; by default the process's.
+    """
+    # Read as PyTorch is imported. Its threads wait for each other less greedily: with the default
+    # of 300,000 turns two of them that share a core for a moment hold each other up.
+    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    arguments = sys.argv[1:] if argv is None else list(argv)
+    args = make_parser(_COMMANDS).parse_args(arguments)
+    args.command_line = shlex.join([PROGRAM, *arguments])
+    try:
+        args.run_command(args)
+    except (ValueError, OSError, RuntimeError, MemoryError, OverflowError) as error:
+        print(f"{PROGRAM}: {_sentence(error)}", file=sys.stderr)
+        return USER_ERROR
+    except KeyboardInterrupt:
+        hint = "interrupted"
+        if args.run_command is _train and args.run.exists():
+            hint += f"; go on with: {PROGRAM} train --resume --run {shlex.quote(str(args.run))}"
+        if args.run_command is _compare:
+            hint += "; the same command goes on where it stopped"
+        print(f"{PROGRAM}: {hint}", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def _sentence(error: Exception) -> str:
+    """Say in one line what went wrong."""
+    if isinstance(error, MemoryError):
+        return f"there is not enough memory ({error})"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.strerror}: {error.filename}"
+    return " ".join(str(error).split())
+
+
+def _train(args: argparse.Namespace) -> None:
+    from ..runs.experiment import train
+    from ..runs.progress import ProgressBar
+    from ..runs.run_folder import CONFIG
+
+    resume = args.resume or (args.resume_or_start and (args.run / CONFIG).exists())
+    config = _resumed_config(args) if resume else _config(args)
+    with ProgressBar(config.total_timesteps, quiet=args.quiet) as bar:
+        result = train(
+            config,
+            args.run,
+            resume=resume,
+            report=bar.say,
+            progress=bar.update,
+            command=args.command_line,
+        )
+        _illustrate(args.run, config, bar.say)
+    if not args.quiet:
+        row = {name: result[name] for name in ("task", "method", "seed", "k_max")}
+        row |= {"env steps": f"{result['env_steps']:,}", "minutes": result["wall_s"] / 60.0}
+        _print_table({**row, "success": f"{result['success_rate']:.3f} of {result['episodes']}"})
+
+
+def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> None:
+    """Draw what a finished run folder has no new picture of; say what could not be drawn."""
+    from ..comparison.plots import draw_curves
+    from ..imagination.goal_predictor import GoalPredictor
+    from ..runs.object_stage_files import PREDICTOR
+    from ..runs.run_folder import POLICY, RESULT
+    from .pictures import draw_imagined, draw_task, record
+
+    env_id = config.env_id
+    makers: dict[str, Callable[[Path], Any]] = {
+        CURVE: lambda out: draw_curves([run], out),
+        "task.png": lambda out: draw_task(env_id, out),
+    }
+    if (run / PREDICTOR).exists():
+        predictor = GoalPredictor.load(run / PREDICTOR, env_id=env_id)
+        makers["imagined.png"] = lambda out: draw_imagined(env_id, predictor, out)
+    makers[VIDEO] = lambda out: record(run / POLICY, env_id, out)
+    failed: dict[str, list[str]] = {}
+    for name, make in makers.items():
+        picture = run / name
+        if picture.exists() and picture.stat().st_mtime >= (run / RESULT).stat().st_mtime:
+            continue
+        try:
+            make(run / name)
+        except Exception as error:  # graphics drivers raise anything; the run itself is done
+            failed.setdefault(" ".join(str(error).split()), []).append(name)
+    for reason, names in failed.items():
+        say(f"left out {', '.join(names)}: {reason}")
+
+
+def _config(args: argparse.Namespace) -> RunConfig:
+    """Return the configuration that the flags describe."""
+    from ..settings.presets import parse_override, run_config
+
+    if args.env is None:
+        raise ValueError("say which task to train with --env, e.g. --env FollowObject/PnPShelf-v0")
+    overrides = {"n_timesteps": args.steps, "n_envs": args.n_envs}
+    overrides |= {"n_threads": args.threads, "torch_threads": args.threads}
+    overrides = {name: value for name, value in overrides.items() if value is not None}
+    config = run_config(
+        args.env,
+        method=args.method,
+        preset=args.preset or "default",
+        file=args.config,
+        seed=args.seed or 0,
+        overrides=overrides | dict(parse_override(text) for text in args.set),
+    )
+    for text in args.set:
+        if text.split("=")[0].split(".")[0] in _OF_IMAGINED and not config.settings["imagine"]:
+            raise ValueError(
+                f"--set {text} does nothing: method {config.method!r} imagines no goals"
+            )
+    return config
+
+
+def _resumed_config(args: argparse.Namespace) -> RunConfig:
+    """Return the folder's configuration; flags may repeat it and change only the steps."""
+    from ..settings.presets import load_config
+
+    config = load_config(args.run)
+    if args.steps is not None:
+        config = dataclasses.replace(config, total_timesteps=args.steps)
+    said = {
+        "env": (args.env, config.full_id),
+        "method": (args.method, config.method),
+        "seed": (args.seed, config.seed),
+        "n-envs": (args.n_envs, config.settings.get("n_envs")),
+        "threads": (args.threads, config.torch_threads),
+    }
+    for name, (given, kept) in said.items():
+        if given is not None and given != kept:
+            raise ValueError(f"the run in {args.run} has --{name} {kept}, not {given}")
+    if args.set or args.config or args.preset:
+        args.env, args.method, args.seed = config.full_id, config.method, config.seed
+        args.steps = config.total_timesteps
+        return _config(args)  # train() compares it with the folder's
+    return config
+
+
+def _evaluate(args: argparse.Namespace) -> None:
+    from ..comparison.cross import cross_test
+    from ..runs.experiment import evaluate
+    from ..runs.run_folder import POLICY, trained_steps
+    from ..settings.presets import load_config
+
+    config = load_config(args.run)
+    env_id = args.env or config.env_id
+    seed = config.seed if args.seed is None else args.seed
+    if env_id in (config.env_id, config.full_id):
+        rate = evaluate(args.run / POLICY, env_id, args.episodes, seed).success_rate
+    else:
+        rate = cross_test(args.run, env_id, args.episodes, seed)
+    result = {
+        "env": env_id,
+        "method": config.method,
+        "seed": config.seed,
+        "episodes": args.episodes,
+        "success_rate": rate,
+        "env_steps": trained_steps(args.run),
+    }
+    if args.json:
+        print(json.dumps(result))
+    else:
+        _print_table(result)
+
+
+def _watch(args: argparse.Namespace) -> None:
+    from ..runs.run_folder import POLICY
+    from ..settings.presets import load_config
+    from .pictures import record
+
+    config = load_config(args.run)
+    out = _named(args.out or args.run / VIDEO, ".mp4")
+    rate = record(args.run / POLICY, config.env_id, out, args.episodes, args.seed)
+    print(f"{out}: {args.episodes} episodes, success {rate:.2f}")
+
+
+def _plot(args: argparse.Namespace) -> None:
+    from ..comparison.figures import draw_results
+    from ..comparison.plots import draw_curves
+
+    if bool(args.runs) == bool(args.results):
+        raise ValueError("give either run folders or --results FOLDER, a folder of run folders")
+    if args.results:
+        for path in draw_results(args.results, args.out or args.results / "figures"):
+            print(path)
+        return
+    out = args.out or (args.runs[0] / CURVE if len(args.runs) == 1 else Path(CURVE))
+    draw_curves(args.runs, _named(out, ".png"))
+    print(out)
+
+
+def _named(out: Path, ending: str) -> Path:
+    """Return a file's path, if its name says what will be in it."""
+    if out.suffix.lower() != ending:
+        raise ValueError(f"{out} does not end in {ending}, which is what is written")
+    return out
+
+
+def _compare(args: argparse.Namespace) -> None:
+    from ..common.files import lock
+    from ..comparison.compare import Comparison, share_cores, write_report
+    from ..comparison.executors import Executor, LocalExecutor
+    from ..comparison.grid import LOGS, Settings, plan
+    from ..comparison.grid_display import GridDisplay
+    from ..envs.batch import cores
+    from ..settings.presets import parse_override
+
+    overrides = dict(parse_override(text) for text in args.set)
+    settings = Settings(args.steps, args.preset, overrides, args.paper_evaluation)
+    grid = (args.out, args.tasks, args.methods, args.seeds, settings)
+    n_runs = len(plan(*grid))  # what cannot be meant is refused before a cluster is asked for
+    executor: Executor
+    if args.ray is None:
+        jobs, threads = share_cores(cores(), n_runs, args.jobs, args.threads)
+        executor = LocalExecutor(jobs, args.out / LOGS)
+    else:
+        from ..comparison.ray_executor import RayExecutor, connect
+
+        jobs, threads = share_cores(
+            connect(args.ray, args.threads or 1), n_runs, args.jobs, args.threads or 1
+        )
+        executor = RayExecutor(jobs)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with lock(args.out, wait=False), GridDisplay(quiet=args.quiet) as display:
+        comparison = Comparison(
+            args.out, plan(*grid, threads), settings, executor, threads, display, args.retry_failed
+        )
+        try:
+            failed = comparison.run()
+        finally:
+            write_report(args.out, display.say)
+    if not args.quiet:
+        print((args.out / "table.md").read_text(), end="")
+    if failed:
+        raise RuntimeError(f"{len(failed)} of {n_runs} runs failed: {', '.join(failed)}")
+
+
+def _predictor(args: argparse.Namespace) -> None:
+    import torch as th
+
+    from ..runs.predictor_cache import learn_predictor
+
+    args.steps = args.n_envs = args.threads = None
+    config = _config(args)
+    if args.out.exists() and not (args.out.is_dir() and not any(args.out.iterdir())):
+        raise ValueError(f"{args.out} is not empty; give another folder")
+    th.set_num_threads(1)
+    learn_predictor(config, args.out)
+    print(args.out)
+
+
+def _print_table(row: dict[str, Any]) -> None:
+    """Print one result."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table()
+    for name in row:
+        table.add_column(name, overflow="fold")  # of names that differ in their last letter only
+    table.add_row(*map(_cell, row.values()))
+    Console().print(table)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+_COMMANDS = {
+    "train": _train,
+    "evaluate": _evaluate,
+    "watch": _watch,
+    "plot": _plot,
+    "compare": _compare,
+    "predictor": _predictor,
+}

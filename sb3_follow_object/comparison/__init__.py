@@ -1,0 +1,1 @@
+"""Grids of tasks, methods and seeds: run, tested, drawn (section 5)."""

@@ -1,0 +1,237 @@
+"""A comparison: a grid of tasks, methods and seeds, run as many at once as there are places."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ..common.extras import MissingExtra
+from ..common.reports import Trouble
+from ..runs.run_folder import POLICY, trained_steps
+from .cross import partner, read_cross_tests
+from .executors import Executor, Message
+from .grid import ATTEMPTS, OBJECT, Cell, Ledger, Settings, prepare, shared_stage, stage_is_ready
+from .grid_display import GridDisplay
+from .worker import CROSS, STAGE, TRAIN, Job
+
+_POLL = 1.0  # seconds
+
+
+def share_cores(
+    n_cores: int, n_runs: int, jobs: int | None, threads: int | None
+) -> tuple[int, int]:
+    """Return how many runs go at once and how many cores each of them gets.
+
+    Args:
+        n_cores: that there are, >= 1.
+        n_runs: that are wanted, >= 1; more at once than that would leave cores idle.
+        jobs: at once, >= 1; None takes as many as fit.
+        threads: of each run, >= 1; None shares the cores out.
+
+    Raises:
+        ValueError: a number below 1.
+    """
+    for name, value in (("jobs", jobs), ("threads", threads)):
+        if value is not None and value < 1:
+            raise ValueError(f"{name} is {value}; it must be at least 1")
+    if jobs is None:
+        jobs = max(1, min(n_runs, n_cores // (threads or 1)))
+    return jobs, threads or max(1, n_cores // jobs)
+
+
+class Comparison:
+    """Runs what is missing of a grid.
+
+    Args:
+        folder: of the results.
+        cells: the runs that are wanted, from `plan`.
+        settings: that they were planned with.
+        executor: runs the jobs.
+        threads: cores of each job, >= 1.
+        display: shows how they go.
+        retry_failed: give runs that failed before another two attempts.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        cells: Sequence[Cell],
+        settings: Settings,
+        executor: Executor,
+        threads: int,
+        display: GridDisplay,
+        retry_failed: bool = False,
+    ):
+        self._cells = {cell.name: cell for cell in cells}
+        self._ledger = Ledger(Path(folder), settings, cells, retry_failed)
+        self._executor = executor
+        self._threads = threads
+        self._display = display
+        self._jobs: dict[str, Job] = {}  # under way, by their names
+        self._failures: dict[str, int] = {}  # of object stages and cross tests
+        self._requests = 0  # to stop
+        self._stopping = False
+
+    def run(self) -> list[str]:
+        """Run until nothing is left to do; return the names of the cells that failed.
+
+        Raises:
+            KeyboardInterrupt: on Ctrl-C or SIGTERM, once all runs have written a checkpoint.
+        """
+        for cell in self._cells.values():
+            over = cell.finished or self._ledger.failed(cell.name)
+            total = 0 if over else cell.config.total_timesteps
+            self._display.expect(cell.name, total, trained_steps(cell.folder) or 0)
+        with _stop_on_signals(self._request_stop):
+            try:
+                self._fill()
+                while self._jobs:
+                    self._listen()
+                    self._stop_when_asked()
+                    self._fill()
+                    self._display.refresh()
+            except Exception:  # a full disk, say: what runs writes its checkpoint and ends
+                self._requests = max(self._requests, 1)
+                while self._jobs:
+                    self._stop_when_asked()
+                    self._listen()
+                raise
+        if self._requests:
+            raise KeyboardInterrupt
+        return [
+            name
+            for name, cell in self._cells.items()
+            if not cell.finished and self._ledger.failed(name)
+        ]
+
+    def _listen(self) -> None:
+        for name, message in self._executor.messages(_POLL):
+            self._take(name, message)
+
+    def _request_stop(self) -> None:
+        self._requests += 1  # heeded between two jobs: a signal may come while one is started
+
+    def _stop_when_asked(self) -> None:
+        if self._requests and not self._stopping:
+            self._stopping = True
+            self._requests = 1
+            self._display.say("stopping: each run writes a checkpoint first")
+            self._executor.stop()
+        elif self._requests > 1:
+            self._requests = 1
+            self._executor.stop()
+
+    def _fill(self) -> None:
+        """Start jobs while there are places and jobs."""
+        while not self._requests and len(self._jobs) < self._executor.slots:
+            job = self._next_job()
+            if job is None:
+                break
+            self._executor.start(job)
+            self._jobs[job.name] = job
+            self._display.started(job.name, job.kind)
+        left = [c for c in self._cells.values() if not c.finished and not self._failed(c)]
+        finished = sum(cell.finished for cell in self._cells.values())
+        failed = len(self._cells) - finished - len(left)
+        self._display.count(finished, failed, len(self._cells))
+
+    def _failed(self, cell: Cell) -> bool:
+        return self._ledger.failed(cell.name)
+
+    def _next_job(self) -> Job | None:
+        """Return what to do next in the cells' order, None while all that is left must wait."""
+        for cell in self._cells.values():
+            job = self._job_of(cell)
+            if job is not None and job.name not in self._jobs:
+                return job
+        return None
+
+    def _job_of(self, cell: Cell) -> Job | None:
+        """Return the next job that a cell asks for."""
+        if cell.finished:
+            return self._cross_job(cell)
+        if self._failed(cell) or cell.name in self._jobs:
+            return None
+        stage = shared_stage(cell)
+        if stage is not None and not stage_is_ready(stage):
+            name = f"{OBJECT}/{stage.name}"
+            if self._failures.get(name, 0) >= ATTEMPTS:
+                error = f"its object stage failed (see {name})"
+                self._ledger.note_failure(cell.name, error, final=True)
+                return None
+            return Job(STAGE, name, str(stage), self._threads)
+        prepare(cell, stage)
+        return Job(TRAIN, cell.name, str(cell.folder), self._threads, command=cell.command)
+
+    def _cross_job(self, cell: Cell) -> Job | None:
+        other = partner(cell.task)
+        name = f"{cell.name} on {other}"
+        if other is None:
+            return None
+        kept = read_cross_tests(cell.folder).get(other)
+        if kept is not None and kept["episodes"] >= cell.config.n_final_episodes:
+            return None
+        if self._failures.get(name, 0) >= ATTEMPTS or not (cell.folder / POLICY).exists():
+            return None
+        env_id = cell.config.env_id.replace(cell.task, other)
+        return Job(CROSS, name, str(cell.folder), self._threads, other=env_id)
+
+    def _take(self, name: str, message: Message) -> None:
+        """Note what a job told."""
+        if "failed" in message or "stopped" in message:
+            self._jobs.pop(name)
+            if not self._stopping:
+                self._note_failure(name, message.get("failed") or "it was stopped from outside")
+            self._display.ended(name)
+        elif "finished" in message:
+            self._jobs.pop(name)
+            if name in self._cells:
+                self._ledger.note_success(name)
+            self._display.ended(name, finished=True)
+        else:
+            self._display.update(name, message)
+
+    def _note_failure(self, name: str, error: str) -> None:
+        if name in self._cells:
+            self._ledger.note_failure(name, error)
+            last = self._ledger.failed(name)
+        else:
+            self._failures[name] = self._failures.get(name, 0) + 1
+            last = self._failures[name] >= ATTEMPTS
+        again = "it failed twice and is given up" if last else "it is taken up once more"
+        self._display.say(Trouble(f"{name} failed: {error}; {again}"))
+
+
+@contextmanager
+def _stop_on_signals(request: Callable[[], None]) -> Iterator[None]:
+    """Call `request` on SIGINT and SIGTERM."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may set handlers; its owner stops us otherwise
+        return
+
+    def handle(signum: int, frame: Any) -> None:
+        request()
+
+    earlier = {sig: signal.signal(sig, handle) for sig in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for sig, handler in earlier.items():
+            signal.signal(sig, handler)
+
+
+def write_report(folder: Path, say: Callable[[str], None]) -> None:
+    """Write the tables and, where matplotlib is installed, the figures into the results folder."""
+    from .figures import draw_results
+    from .results import read_results, write_tables
+
+    write_tables(read_results(folder), folder)
+    try:
+        draw_results(folder, folder / "figures")
+    except MissingExtra as error:
+        say(f"left out the figures: {error}")

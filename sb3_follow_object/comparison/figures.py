@@ -1,0 +1,210 @@
+"""The paper's figures from a folder of results; what has not been run is drawn as not run."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.extras import need
+from ..common.files import atomic_write
+from ..envs import TASKS
+from ..runs.run_folder import EVALUATIONS
+from ..settings.methods import METHODS
+from .cross import PAIR, read_cross_tests
+from .grid import FINISHED, UNFINISHED
+from .plots import X_AXES, Curve, read_curve, spread
+from .results import Group, group_runs, ordered, quartiles, read_results
+
+PNP_SIMPLE, OTHER_TASKS = "pnp_simple.png", "other_tasks.png"
+WALL_TIME, FINAL_SUCCESS = "wall_time.png", "final_success.png"
+
+_HATCH = {"hatch": "///", "facecolor": "none", "edgecolor": "0.6", "linewidth": 0.0}
+_BASELINE = "her"  # the paper's HER-a and HER-b
+_SHADES = {"a": "0.35", "b": "0.7"}  # no method's colour: the bars name what they show
+
+
+def draw_results(
+    results: str | os.PathLike[str], out: str | os.PathLike[str], methods: Sequence[str] = METHODS
+) -> list[Path]:
+    """Draw the paper's two figures, success against wall time, and all final successes.
+
+    Args:
+        results: folder of runs, as `compare` and benchmarks/results lay it out.
+        out: folder for the figures; is created.
+        methods: that should be there; one without runs is drawn as not run, and a method that has
+            runs is drawn whether it is named or not.
+
+    Returns:
+        The PNG files.
+
+    Raises:
+        MissingExtra: matplotlib is not installed.
+        ValueError: the folder holds no runs.
+    """
+    runs = read_results(results)
+    drawn = list(dict.fromkeys([*methods, *ordered(METHODS, (run.method for run in runs))]))
+    tasks = [*TASKS, *sorted({run.task for run in runs} - set(TASKS))]
+    groups = group_runs(runs, tasks, drawn)
+    others = [task for task in TASKS if task not in PAIR]
+    figures: dict[str, Callable[[], Any]] = {
+        PNP_SIMPLE: lambda: _pnp_simple(groups, drawn),
+        OTHER_TASKS: lambda: _curves(groups, drawn, others, "env_steps"),
+        WALL_TIME: lambda: _curves(groups, drawn, tasks, "wall_s"),
+        FINAL_SUCCESS: lambda: _final_success(groups, drawn, tasks),
+    }
+    need("matplotlib", "plots")
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    for name, draw in figures.items():
+        image = io.BytesIO()
+        draw().savefig(image, format="png", dpi=110)
+        atomic_write(out / name, image.getvalue())
+    return [out / name for name in figures]
+
+
+def _pnp_simple(groups: Sequence[Group], methods: Sequence[str]) -> Any:
+    """Return the paper's figure on PnP-Simple: HER's cross test, and all methods on both."""
+    figure, axes = _figure(1, 3)
+    _cross_panel(axes[0], groups)
+    for axis, task in zip(axes[1:], PAIR, strict=True):
+        _curve_panel(axis, groups, methods, task, "env_steps")
+    _legend(figure, methods)
+    return figure
+
+
+def _curves(groups: Sequence[Group], methods: Sequence[str], tasks: Sequence[str], x: str) -> Any:
+    """Return learning curves, a panel a task; of six tasks they are the paper's last figure."""
+    figure, axes = _figure(-(-len(tasks) // 3), 3)
+    for axis, task in zip(axes, tasks, strict=False):
+        _curve_panel(axis, groups, methods, task, x)
+    for axis in axes[len(tasks) :]:
+        axis.axis("off")
+    _legend(figure, methods)
+    return figure
+
+
+def _final_success(groups: Sequence[Group], methods: Sequence[str], tasks: Sequence[str]) -> Any:
+    """Return a matrix of final successes, hatched where there is none."""
+    patches = need("matplotlib.patches", "plots")
+    figure = need("matplotlib.figure", "plots").Figure(
+        figsize=(2.2 + 1.25 * len(methods), 1.2 + 0.55 * len(tasks)), layout="constrained"
+    )
+    axis = figure.subplots()
+    medians = np.full((len(tasks), len(methods)), np.nan)
+    for group in groups:
+        row, column = tasks.index(group.task), methods.index(group.method)
+        lines, color = group.missing.split(", ") if group.missing else [], "black"
+        if group.of(FINISHED):
+            _, middle, _ = quartiles(group.success)
+            medians[row, column] = middle
+            lines = [f"{middle:.2f} ({len(group.success)})", *lines]
+            color = "black" if middle > 0.6 else "white"
+        else:
+            axis.add_patch(patches.Rectangle((column - 0.5, row - 0.5), 1, 1, **_HATCH))
+        text = "\n".join(lines)
+        axis.text(column, row, text, ha="center", va="center", fontsize=8, color=color)
+    image = axis.imshow(medians, vmin=0.0, vmax=1.0, cmap="viridis", aspect="auto")
+    axis.set_xticks(range(len(methods)), methods)
+    axis.set_yticks(range(len(tasks)), tasks)
+    figure.colorbar(image, label="final success, median over seeds")
+    return figure
+
+
+def _cross_panel(axis: Any, groups: Sequence[Group]) -> None:
+    """Draw how HER, trained on each of the two versions, does on both."""
+    cells = {group.task: group for group in groups if group.method == _BASELINE}
+    labels = []
+    for place, ((letter, trained), tested) in enumerate(
+        (version, tested) for version in zip("ab", PAIR, strict=True) for tested in PAIR
+    ):
+        labels.append(f"HER-{letter} on\n{tested}")
+        group = cells.get(trained)
+        values = _cross_values(group, tested) if group else np.empty(0)
+        if not len(values):
+            axis.bar(place, 1.0, width=0.8, **_HATCH)
+            missing = group.missing if group and group.missing else "not tested"
+            axis.text(place, 0.5, missing, ha="center", va="center", rotation=90)
+            continue
+        low, middle, high = quartiles(values)
+        error = [[middle - low], [high - middle]]
+        axis.bar(place, middle, width=0.8, yerr=error, capsize=3, color=_SHADES[letter])
+        axis.text(place, middle + 0.02, f"{middle:.2f}", ha="center")
+    axis.set_xticks(range(len(labels)), labels, fontsize=7)
+    axis.set_title("HER-a and HER-b", pad=16)
+    axis.set(ylabel="final success", ylim=(0.0, 1.1))
+
+
+def _cross_values(group: Group, tested: str) -> np.ndarray:
+    """Return the success rates on one version of policies trained on the group's, (n,)."""
+    if tested == group.task:
+        return group.success
+    tests = [read_cross_tests(run.folder) for run in group.of(FINISHED)]
+    return np.array([test[tested]["success_rate"] for test in tests if tested in test])
+
+
+def _curve_panel(
+    axis: Any, groups: Sequence[Group], methods: Sequence[str], task: str, x: str
+) -> None:
+    """Draw all methods' curves on a task: median and quartiles; single runs while unfinished."""
+    ticker = need("matplotlib.ticker", "plots")
+    label, unit = X_AXES[x]
+    notes: dict[str, list[str]] = {}  # methods by what is missing
+    for group in (group for group in groups if group.task == task):
+        color = _color(methods, group.method)
+        finished = _read_curves(group, FINISHED)
+        missing = group.missing or ("" if finished else "no validations")
+        if missing:
+            notes.setdefault(missing, []).append(group.method)
+        if finished:
+            points, (low, middle, high) = spread(finished, x, "success_rate")
+            axis.plot(points / unit, middle, color=color, marker="." if len(points) < 3 else "")
+            if len(finished) > 1:
+                axis.fill_between(points / unit, low, high, alpha=0.2, color=color)
+        for curve in _read_curves(group, UNFINISHED):
+            xs = curve.columns[x] / unit
+            axis.plot(xs, curve.columns["success_rate"], color=color, linestyle=":", marker=".")
+    axis.set(xlabel=label, ylabel="success on original goals", ylim=(-0.02, 1.02))
+    axis.set_title(task, pad=16)
+    note = "; ".join(f"{what}: {', '.join(names)}" for what, names in notes.items())
+    axis.text(0.5, 1.02, note, transform=axis.transAxes, ha="center", fontsize=7)
+    axis.grid(alpha=0.3)
+    if axis.lines:
+        axis.set_xlim(0, None)
+        axis.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
+    else:
+        patches = need("matplotlib.patches", "plots")
+        axis.add_patch(patches.Rectangle((0, 0), 1, 1, transform=axis.transAxes, **_HATCH))
+        axis.set_xticks([])
+
+
+def _read_curves(group: Group, status: str) -> list[Curve]:
+    """Return the curves of a group's runs of one status that were validated at least once."""
+    curves = []
+    for run in group.of(status):
+        path = run.folder / EVALUATIONS
+        if path.exists() and len(path.read_text().splitlines()) > 1:
+            curves.append(read_curve(run.folder))
+    return curves
+
+
+def _figure(rows: int, columns: int) -> tuple[Any, list[Any]]:
+    figure = need("matplotlib.figure", "plots").Figure(
+        figsize=(4.4 * columns, 3.2 * rows + 0.5), layout="constrained"
+    )
+    return figure, list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
+
+
+def _legend(figure: Any, methods: Sequence[str]) -> None:
+    lines = need("matplotlib.lines", "plots")
+    handles = [lines.Line2D([], [], color=_color(methods, m), label=m) for m in methods]
+    handles.append(lines.Line2D([], [], color="0.4", linestyle=":", marker=".", label="unfinished"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+
+
+def _color(methods: Sequence[str], method: str) -> str:
+    return f"C{list(methods).index(method) % 10}"

@@ -1,0 +1,319 @@
+"""A folder of runs as rows, statistics over seeds, and tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.extras import MissingExtra, need
+from ..common.files import atomic_write
+from ..envs import TASKS
+from ..runs.run_folder import CONFIG, RESULT, read_result, trained_steps
+from ..settings.methods import METHODS
+from ..settings.presets import load_config
+from .grid import ATTEMPTS, FAILED, FINISHED, NOT_RUN, UNFINISHED, read_grid, task_name
+
+TABLE_CSV, TABLE_MD = "table.csv", "table.md"
+
+_BOOTSTRAP_SAMPLES = 2000
+_BOOTSTRAP_SEED = 0
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a results folder, or one that should be there.
+
+    Attributes:
+        folder: of the run, whether it exists or not.
+        task: its short name, or another environment's id.
+        method: its name.
+        seed: its seed.
+        status: FINISHED, FAILED, UNFINISHED or NOT_RUN.
+        env_steps: so far; None where nothing tells.
+        wall_s: seconds that the whole run took; None before its end.
+        success_rate: of the final test, in [0, 1]; None before the end.
+        error: why it failed; None where it did not.
+    """
+
+    folder: Path
+    task: str
+    method: str
+    seed: int
+    status: str
+    env_steps: int | None = None
+    wall_s: float | None = None
+    success_rate: float | None = None
+    error: str | None = None
+
+
+@dataclass(frozen=True)
+class Group:
+    """All seeds of a method on a task.
+
+    Attributes:
+        task: its name.
+        method: its name.
+        runs: those that a folder or a grid names; none where nobody asked for any.
+    """
+
+    task: str
+    method: str
+    runs: tuple[Run, ...]
+
+    def of(self, status: str) -> list[Run]:
+        """Return the runs of one status."""
+        return [run for run in self.runs if run.status == status]
+
+    @property
+    def success(self) -> np.ndarray:
+        """Final success rates of the finished runs, (n,)."""
+        return np.array([run.success_rate for run in self.of(FINISHED)], dtype=np.float64)
+
+    @property
+    def status(self) -> str:
+        """FINISHED when every run is, else what most needs saying."""
+        if not self.runs:
+            return NOT_RUN
+        found = {run.status for run in self.runs}
+        return next(s for s in (FAILED, UNFINISHED, NOT_RUN, FINISHED) if s in found)
+
+    @property
+    def missing(self) -> str:
+        """What is not finished, in words; empty where everything is."""
+        if not self.runs:
+            return NOT_RUN
+        counts = {status: len(self.of(status)) for status in (FAILED, UNFINISHED, NOT_RUN)}
+        one = len(self.runs) == 1
+        return ", ".join(s if one else f"{n} {s}" for s, n in counts.items() if n)
+
+
+def read_results(folder: str | os.PathLike[str]) -> list[Run]:
+    """Read a folder of run folders, and the runs that its grid file names beside them.
+
+    Raises:
+        ValueError: it holds no runs, or a file of a run is damaged.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is not a folder of results")
+    cells = (read_grid(folder) or {"cells": {}})["cells"]
+    runs = {
+        path.name: _read_run(path, cells.get(path.name))
+        for path in sorted(folder.iterdir())
+        if (path / CONFIG).exists() and not path.name.startswith(".")
+    }
+    for name, cell in cells.items():
+        if name not in runs:
+            failed = cell["failures"] >= ATTEMPTS
+            status, error = (FAILED, cell["error"]) if failed else (NOT_RUN, None)
+            place = (folder / name, cell["task"], cell["method"], cell["seed"])
+            runs[name] = Run(*place, status=status, error=error)
+    if not runs:
+        raise ValueError(f"{folder} holds no runs: no folder in it has a {CONFIG}")
+    return sorted(runs.values(), key=lambda run: (run.task, run.method, run.seed))
+
+
+def group_runs(
+    runs: Sequence[Run], tasks: Iterable[str] | None = None, methods: Iterable[str] | None = None
+) -> list[Group]:
+    """Return a group for every task and method, with and without runs.
+
+    Args:
+        runs: of a results folder.
+        tasks: in the order wanted; by default those that have runs, the package's first.
+        methods: likewise.
+    """
+    tasks = ordered(TASKS, (run.task for run in runs)) if tasks is None else tasks
+    methods = ordered(METHODS, (run.method for run in runs)) if methods is None else methods
+    methods = list(methods)
+    return [
+        Group(task, method, tuple(r for r in runs if (r.task, r.method) == (task, method)))
+        for task in tasks
+        for method in methods
+    ]
+
+
+def ordered(known: Iterable[str], found: Iterable[str]) -> list[str]:
+    """Return the names that were found, in the known ones' order, the others behind them."""
+    names = set(found)
+    first = [name for name in known if name in names]
+    return first + sorted(names - set(first))
+
+
+def quartiles(values: np.ndarray) -> tuple[float, float, float]:
+    """Return the 25%, 50% and 75% quantiles of values (n,), n >= 1."""
+    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
+    return float(low), float(middle), float(high)
+
+
+def interquartile_means(
+    scores: dict[Any, np.ndarray],
+) -> dict[Any, tuple[float, float, float]]:
+    """Return IQM and 95% interval by a bootstrap stratified over tasks (Agarwal et al. 2021).
+
+    Args:
+        scores: success rates (seeds, tasks), by any key; one seed has an interval of width 0,
+            which says nothing.
+
+    Raises:
+        MissingExtra: rliable is not installed.
+    """
+    library, metrics = need("rliable.library", "plots"), need("rliable.metrics", "plots")
+    earlier = np.random.get_state()  # rliable draws from NumPy's global stream
+    np.random.seed(_BOOTSTRAP_SEED)
+    try:
+        points, intervals = library.get_interval_estimates(
+            scores, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=_BOOTSTRAP_SAMPLES
+        )
+    finally:
+        np.random.set_state(earlier)
+    return {
+        key: (float(points[key][0]), float(intervals[key][0][0]), float(intervals[key][1][0]))
+        for key in scores
+    }
+
+
+def across_tasks(groups: Sequence[Group]) -> tuple[list[str], int, dict[str, np.ndarray]]:
+    """Return what methods can be compared on: tasks and seeds that all of them have.
+
+    A method that has not finished a single run does not narrow the choice.
+
+    Returns:
+        The tasks; the number of seeds, the first ones of each; and by method the success rates
+        (seeds, tasks). Empty where no task is common to two or more methods' finished runs.
+    """
+    finished = {(g.task, g.method): g.success for g in groups if len(g.success)}
+    methods = list(dict.fromkeys(method for _, method in finished))
+    tasks = [
+        task
+        for task in dict.fromkeys(g.task for g in groups)
+        if all((task, method) in finished for method in methods)
+    ]
+    if not tasks or len(methods) < 2:
+        return [], 0, {}
+    n = min(len(finished[task, method]) for task in tasks for method in methods)
+    return (
+        tasks,
+        n,
+        {m: np.stack([finished[t, m][:n] for t in tasks], axis=1) for m in methods},
+    )
+
+
+def table_rows(groups: Sequence[Group]) -> list[dict[str, Any]]:
+    """Return a row for each group: counts, final success over seeds, cost; None where unknown."""
+    keyed = {(g.task, g.method): g.success[:, None] for g in groups if len(g.success) > 1}
+    try:
+        means = interquartile_means(keyed) if keyed else {}
+    except MissingExtra:
+        means = {}
+    rows = []
+    for group in groups:
+        finished = group.of(FINISHED)
+        low, middle, high = quartiles(group.success) if finished else (None, None, None)
+        iqm = means.get((group.task, group.method), (None, None, None))
+        rows.append(
+            {
+                "task": group.task,
+                "method": group.method,
+                "seeds": len(group.runs),
+                **{s.replace(" ", "_"): len(group.of(s)) for s in (FINISHED, FAILED, UNFINISHED)},
+                "median": middle,
+                "q25": low,
+                "q75": high,
+                "iqm": iqm[0],
+                "iqm_low": iqm[1],
+                "iqm_high": iqm[2],
+                "env_steps": _median([run.env_steps for run in finished]),
+                "wall_s": _median([run.wall_s for run in finished]),
+                "status": group.missing or FINISHED,
+            }
+        )
+    return rows
+
+
+def csv_table(groups: Sequence[Group]) -> str:
+    """Return the final success as CSV, a row for each task and method."""
+    rows = table_rows(groups)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()})
+    return text.getvalue()
+
+
+def markdown_table(groups: Sequence[Group]) -> str:
+    """Return the final success as Markdown, a line a task and a column a method.
+
+    A cell holds the median over seeds, the quartiles where there are two seeds or more, the
+    number of finished seeds, and what has not been finished.
+    """
+    methods = list(dict.fromkeys(group.method for group in groups))
+    cells = {(group.task, group.method): _cell(group) for group in groups}
+    lines = [f"| task | {' | '.join(methods)} |", "|---" * (len(methods) + 1) + "|"]
+    for task in dict.fromkeys(group.task for group in groups):
+        lines.append(f"| {task} | {' | '.join(cells[task, method] for method in methods)} |")
+    lines += ["", "Median [quartiles] of the final success over finished seeds."]
+    return "\n".join([*lines, *_aggregate_lines(groups), *_failure_lines(groups)]) + "\n"
+
+
+def write_tables(runs: Sequence[Run], folder: str | os.PathLike[str]) -> None:
+    """Write table.md and table.csv of all runs into a folder."""
+    groups = group_runs(runs)
+    atomic_write(Path(folder) / TABLE_MD, markdown_table(groups).encode())
+    atomic_write(Path(folder) / TABLE_CSV, csv_table(groups).encode())
+
+
+def _cell(group: Group) -> str:
+    n = len(group.success)
+    if not n:
+        return group.missing
+    low, middle, high = quartiles(group.success)
+    text = f"{middle:.2f}" + (f" [{low:.2f}, {high:.2f}]" if n > 1 else "") + f" ({n})"
+    return f"{text}; {group.missing}" if group.missing else text
+
+
+def _aggregate_lines(groups: Sequence[Group]) -> list[str]:
+    tasks, n, scores = across_tasks(groups)
+    if not tasks:
+        return []
+    try:
+        means = interquartile_means(scores)
+    except MissingExtra as error:
+        return ["", f"No interquartile means: {error}."]
+    lines = ["", "| method | IQM | 95% interval |", "|---|---|---|"]
+    for method, (mean, low, high) in means.items():
+        interval = f"[{low:.2f}, {high:.2f}]" if n > 1 else "one seed"
+        lines.append(f"| {method} | {mean:.2f} | {interval} |")
+    what = f"{', '.join(tasks)}; {n} seed{'s' if n > 1 else ''} each"
+    return [*lines, "", f"Interquartile mean over the tasks that all of these ran: {what}."]
+
+
+def _failure_lines(groups: Sequence[Group]) -> list[str]:
+    failed = [run for group in groups for run in group.of(FAILED)]
+    return ["", *(f"- {run.folder.name} failed: {run.error}" for run in failed)] if failed else []
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
+
+
+def _read_run(path: Path, cell: dict[str, Any] | None) -> Run:
+    config = load_config(path)
+    place = (path, task_name(config.env_id), config.method, config.seed)
+    if (path / RESULT).exists():
+        result = read_result(path)
+        figures = {name: result[name] for name in ("env_steps", "wall_s", "success_rate")}
+        return Run(*place, status=FINISHED, **figures)
+    steps = trained_steps(path)
+    if cell is not None and cell["failures"] >= ATTEMPTS:
+        return Run(*place, status=FAILED, env_steps=steps, error=cell["error"])
+    return Run(*place, status=UNFINISHED, env_steps=steps)

@@ -1,0 +1,94 @@
+"""An actor and its normaliser alone in a file: small, and without pickle."""
+
+from __future__ import annotations
+
+import os
+from itertools import pairwise
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.td3.policies import Actor
+from torch import nn
+
+from ..common.array_trees import load_tree, save_tree
+from .policies import NormalizedGoalExtractor
+
+# Activation functions that a policy's file may name.
+_ACTIVATIONS: dict[str, type[nn.Module]] = {
+    each.__name__: each for each in (nn.ReLU, nn.Tanh, nn.ELU, nn.GELU, nn.SiLU)
+}
+
+
+def save_actor(path: str | os.PathLike[str], actor: Actor, env_id: str) -> None:
+    """Save an actor and its normaliser alone: a small file, without pickle.
+
+    Args:
+        path: file to create or replace, e.g. policy.safetensors.
+        actor: of a `HerPolicy`.
+        env_id: the task that it was trained for.
+
+    Raises:
+        ValueError: the actor's activation function is none that a file can name.
+    """
+    extractor = actor.features_extractor
+    assert isinstance(extractor, NormalizedGoalExtractor)
+    activation = actor.activation_fn.__name__
+    if _ACTIVATIONS.get(activation) is not actor.activation_fn:
+        raise ValueError(
+            f"a policy's file can name the activations {', '.join(_ACTIVATIONS)}, not {activation}"
+        )
+    saved = {
+        "env_id": env_id,
+        "net_arch": actor.net_arch,
+        "activation": activation,
+        "clip": extractor.clip,
+        "actor": actor.state_dict(),
+    }
+    save_tree(path, saved)
+
+
+def load_actor(
+    path: str | os.PathLike[str], observation_space: spaces.Dict, action_space: spaces.Box
+) -> tuple[Actor, str]:
+    """Load what `save_actor` wrote; the actor has SB3's `predict`.
+
+    Returns:
+        The actor and the id of the task that it was trained for.
+
+    Raises:
+        ValueError: the file is missing, damaged or made for other spaces.
+    """
+    saved = load_tree(path)
+    try:
+        # The first files had neither.
+        clip, activation = float(saved.get("clip", 5.0)), saved.get("activation", "ReLU")
+        if not clip > 0.0:
+            raise ValueError(f"its inputs are clipped at {clip}")
+        extractor = NormalizedGoalExtractor(observation_space, clip)
+        widths = [extractor.features_dim, *saved["net_arch"], *action_space.shape]
+        _check_layers(saved["actor"], widths)  # before anything of their size is allocated
+        actor = Actor(
+            observation_space,
+            action_space,
+            saved["net_arch"],
+            extractor,
+            extractor.features_dim,
+            _ACTIVATIONS[activation],
+        )
+        actor.load_state_dict(saved["actor"])
+        actor.set_training_mode(False)
+        return actor, str(saved["env_id"])
+    except (AttributeError, KeyError, TypeError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path} is not a policy for this environment ({reason})") from error
+
+
+def _check_layers(tensors: dict[str, th.Tensor], widths: list[int]) -> None:
+    """Raise a ValueError unless the tensors are finite and those of layers with these widths."""
+    if not all(bool(th.isfinite(value).all()) for value in tensors.values()):
+        raise ValueError("it holds NaN or infinity")
+    for layer, (n_in, n_out) in enumerate(pairwise(widths)):
+        # An activation stands between two linear layers, so these have the even places.
+        shape = tuple(tensors[f"mu.{2 * layer}.weight"].shape)
+        if shape != (n_out, n_in):
+            raise ValueError(f"layer {layer} has the shape {shape}, not {(n_out, n_in)}")

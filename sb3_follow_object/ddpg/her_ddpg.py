@@ -1,0 +1,445 @@
+"""SB3's DDPG with what goal-conditioned learning from sparse rewards needs besides."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DDPG
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import (
+    DictReplayBufferSamples,
+    GymEnv,
+    Schedule,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
+
+from ..common.torch_helpers import matmul_at, threads_at
+from ..replay.device_replay import device_replay_of
+from ..replay.her_replay_buffer import FollowObjectReplayBuffer
+from ..settings.ranges import check_positive, check_value
+from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
+from .input_moments import InputMoments
+from .policies import HerPolicy
+from .updates import COLUMNS, Updates
+
+SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
+
+# Transitions drawn from the buffer in one call: enough to spread the fixed cost, small in memory.
+_SAMPLE_CHUNK = 32_768
+# The same on the learner's device, where memory is plenty and a chunk is a graph.
+_DEVICE_CHUNK = 262_144
+_PRECISIONS = ("highest", "high", "medium")
+
+
+class HerDDPG(DDPG):
+    """DDPG as the HER papers run it: normaliser, target clip, action L2, random actions.
+
+    The differences from SB3's DDPG (section 3.2 of the paper and its references):
+
+    - inputs are standardised by running moments of everything stored, clipped to +-5;
+    - the critic's targets are clipped to [-1/(1 - gamma), 0], where returns of a -1/0 reward lie;
+    - with `hindsight_bound` a target is at least what the stored episode proves to be possible;
+    - the actor's loss has `action_l2` times the mean squared action added;
+    - with probability `random_action_prob` an action is uniform, else Gaussian noise is added;
+    - episodes may be collected from several environments at once: `train_freq=(n, "episode")`;
+    - `predict` may use an average of the actor's weights over the last updates: `average_decay`;
+    - target networks may be moved once every `target_update_interval` updates;
+    - a second reward with a critic of its own may be added: `auxiliary`.
+
+    Args:
+        env: with Dict observations "observation", "achieved_goal", "desired_goal", of which the
+            first says where what is to be moved is: the networks read it and the desired goal.
+        gamma: in (0, 1); by default 1 - 1/T for episodes of T steps.
+        train_freq: in episodes of every environment, or in steps of every environment.
+        noise_std: of the Gaussian noise on each action in [-1, 1]; `action_noise` replaces it.
+        random_action_prob: in [0, 1].
+        action_l2: weight, >= 0.
+        target_clip: (low, high) bounds of the targets; "auto" is [-1/(1 - gamma), 0]; None, none.
+        hindsight_bound: raise the target of a transition, whose episode was on the hindsight goal j
+            steps later, to -(1 - gamma^j)/(1 - gamma): the return of doing the same and staying
+            there. Distances are then read off the episodes instead of spreading step by step
+            through the targets. Beyond the paper; for rewards of -1 and 0, objects that can be
+            made to stay, and a `FollowObjectReplayBuffer`.
+        target_update_interval: in gradient updates, >= 1. The authors: once a cycle of 40.
+        average_decay: share in [0, 1) that an update leaves of the averaged actor, which `predict`,
+            validation and saved policies use while the actor itself explores and learns; 0, the
+            actor itself. Beyond the paper: the actor's success moves up and down by a tenth and
+            more from one validation to the next, its average's by less.
+        matmul_precision: of the float32 matrix products of an update, as in
+            `torch.set_float32_matmul_precision`: "medium" lets processors with bfloat16 units
+            multiply in bfloat16 and add up in float32, which is faster; others ignore it.
+        auxiliary: a second reward, whose critic the actor maximises beside the main one:
+            {"name": "rnd"} or {"name": "sldr"} (or a subclass of `AuxiliaryReward` as the name),
+            with the keyword arguments of the reward's class and "weight", 1 by default, of its
+            critic. Its targets have bounds of their own; `hindsight_bound` does not touch them.
+        update_threads: PyTorch's threads in gradient steps; None, as many as it has otherwise.
+        replay_on_device: keep a copy of the replay buffer on the learner's device and draw, relabel
+            and reward there, so that no batch is copied. None: on CUDA, where the buffer's settings
+            and the environment's reward allow it (`DeviceReplay`). True: also on the CPU, and an
+            error where they do not.
+        policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.
+
+    The other arguments are DDPG's.
+
+    Raises:
+        ValueError: for an environment without goals or in VecNormalize, an argument outside its
+            range, or, at the first update, rewards above 0 with `target_clip` "auto".
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": HerPolicy}
+    _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
+    policy: HerPolicy
+    replay_buffer: FollowObjectReplayBuffer | None
+
+    def __init__(
+        self,
+        policy: str | type[HerPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 0,
+        batch_size: int = 512,
+        tau: float = 0.01,
+        gamma: float | None = None,
+        train_freq: int | tuple[int, str] = (1, "episode"),
+        gradient_steps: int = 40,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        noise_std: float = 0.2,
+        random_action_prob: float = 0.3,
+        action_l2: float = 1.0,
+        target_clip: tuple[float, float] | str | None = "auto",
+        hindsight_bound: bool = False,
+        target_update_interval: int = 1,
+        average_decay: float = 0.0,
+        matmul_precision: str = "highest",
+        auxiliary: dict[str, Any] | None = None,
+        update_threads: int | None = None,
+        replay_on_device: bool | None = None,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if not 0.0 <= random_action_prob <= 1.0:
+            raise ValueError(f"random_action_prob is {random_action_prob}; it must lie in [0, 1]")
+        if noise_std < 0.0 or action_l2 < 0.0:
+            raise ValueError(f"noise_std ({noise_std}) and action_l2 ({action_l2}) must be >= 0")
+        if not (target_clip is None or target_clip == "auto" or _is_interval(target_clip)):
+            raise ValueError(f'target_clip is {target_clip!r}; give (low, high), "auto" or None')
+        check_positive(target_update_interval=target_update_interval)
+        if not 0.0 <= average_decay < 1.0:
+            raise ValueError(f"average_decay is {average_decay}; it must lie in [0, 1)")
+        if matmul_precision not in _PRECISIONS:
+            raise ValueError(
+                f"matmul_precision is {matmul_precision!r}; {', '.join(_PRECISIONS)} exist"
+            )
+        if update_threads is not None:
+            check_positive(update_threads=update_threads)
+        if replay_on_device not in (None, False, True):
+            raise ValueError(f"replay_on_device is {replay_on_device!r}; give true, false or none")
+        for name, value in (("gamma", gamma), ("tau", tau), ("batch_size", batch_size)):
+            if value is not None:
+                check_value(name, value, "HerDDPG")
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,  # type: ignore[arg-type]  # resolved in _setup_model
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class or FollowObjectReplayBuffer,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=dict(policy_kwargs or {}),  # DDPG writes into it
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.noise_std = noise_std
+        self.random_action_prob = random_action_prob
+        self.action_l2 = action_l2
+        self.target_clip = target_clip
+        self.hindsight_bound = hindsight_bound
+        self.target_update_interval = target_update_interval
+        self.average_decay = average_decay
+        self.matmul_precision = matmul_precision
+        self.update_threads = update_threads
+        self.auxiliary = auxiliary
+        self.auxiliary_critic: AuxiliaryCritic | None = None
+        self.replay_on_device = replay_on_device
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        keys = getattr(self.observation_space, "spaces", {})
+        missing = {"observation", "achieved_goal", "desired_goal"} - set(keys)
+        if missing:
+            raise ValueError(
+                f"the environment's observations lack {', '.join(sorted(missing))}; HerDDPG needs "
+                "a goal environment with observation, achieved_goal and desired_goal"
+            )
+        if self.gamma is None:
+            self.gamma = 1.0 - 1.0 / self._horizon()
+        if self._vec_normalize_env is not None:
+            raise ValueError(
+                "HerDDPG standardises its inputs itself and knows the range of its rewards; leave "
+                "VecNormalize (rl_zoo3's normalize) out"
+            )
+        if self.auxiliary is not None:
+            self.auxiliary = resolve_auxiliary(self.auxiliary, self.env)
+        super()._setup_model()
+        self.rng = np.random.default_rng(np.random.randint(2**31))
+        if not hasattr(self, "moments"):  # SB3's load() brings them before it comes here
+            self.moments = InputMoments(self.actor.features_dim)
+        if self.auxiliary is not None:
+            # Last, so that what is drawn above does not depend on it.
+            rate = self.lr_schedule(1.0)
+            self.auxiliary_critic = make_auxiliary(self.auxiliary, self.policy, rate, self.gamma)
+        self._updates = Updates(self)
+        self._device_replay = device_replay_of(
+            self.replay_buffer, self.device, self.replay_on_device
+        )
+        if isinstance(self.train_freq, TrainFreq) and (
+            self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1
+        ):
+            steps = self.train_freq.frequency * self._horizon()
+            self.train_freq = TrainFreq(steps, TrainFrequencyUnit.STEP)
+
+    def _horizon(self) -> int:
+        """Steps of an episode, from the environment's spec."""
+        assert self.env is not None
+        spec = self.env.get_attr("spec", indices=[0])[0]
+        if spec is None or spec.max_episode_steps is None:
+            raise ValueError(
+                "the environment does not say how long its episodes are (spec.max_episode_steps); "
+                "give gamma and train_freq in steps"
+            )
+        return int(spec.max_episode_steps)
+
+    def _sample_action(
+        self,
+        learning_starts: int,
+        action_noise: ActionNoise | None = None,
+        n_envs: int = 1,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        assert self._last_obs is not None
+        assert isinstance(self.action_space, spaces.Box)
+        if self.num_timesteps < learning_starts:
+            scaled = self.rng.uniform(-1.0, 1.0, size=(n_envs, *self.action_space.shape))
+        else:
+            action, _ = self.actor.predict(self._last_obs, deterministic=True)
+            scaled = self.policy.scale_action(action)
+            noise = (
+                self.rng.normal(0.0, self.noise_std, size=scaled.shape)
+                if action_noise is None
+                else action_noise()
+            )
+            scaled = np.clip(scaled + noise, -1.0, 1.0)
+            random = self.rng.random(n_envs) < self.random_action_prob
+            scaled[random] = self.rng.uniform(-1.0, 1.0, size=(random.sum(), *scaled.shape[1:]))
+        scaled = scaled.astype(np.float32)
+        return self.policy.unscale_action(scaled), scaled
+
+    def _update_moments(self) -> None:
+        """Standardise inputs from now on by all that has been stored."""
+        assert self.replay_buffer is not None
+        if self.moments.take(self.replay_buffer):
+            self.policy.set_moments(
+                th.as_tensor(self.moments.mean, dtype=th.float32),
+                th.as_tensor(self.moments.std, dtype=th.float32),
+            )
+
+    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        """Load a replay buffer as SB3 does.
+
+        Where the model has moments of its inputs already, they are those of what it loads.
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+        assert self.replay_buffer is not None
+        self.moments.buffer_was_loaded(self.replay_buffer)
+
+    def _excluded_save_params(self) -> list[str]:
+        names = ("auxiliary_critic", "_updates", "_device_replay")
+        return [*super()._excluded_save_params(), *names]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        if self.auxiliary_critic is not None:
+            names.append("auxiliary_critic")
+            names += [f"auxiliary_critic.{name}" for name in self.auxiliary_critic.optimizers]
+        return names, variables
+
+    def training_state(self) -> dict[str, Any]:
+        """Return everything that the next rollout and update depend on, between rollouts.
+
+        The environment has its own state, and so has the replay buffer.
+        """
+        return {
+            "policy": self.policy.state_dict(),
+            "actor_optimizer": self.actor.optimizer.state_dict(),
+            "critic_optimizer": self.critic.optimizer.state_dict(),
+            "auxiliary": None
+            if self.auxiliary_critic is None
+            else self.auxiliary_critic.training_state(),
+            "moments": self.moments.state_dict(),
+            "rng": self.rng.bit_generator.state,
+            "device_rng": None
+            if self._device_replay is None
+            else self._device_replay.generator.get_state(),
+            "last_obs": self._last_obs,
+            "counters": {name: getattr(self, name) for name in self._COUNTERS},
+        }
+
+    def load_training_state(self, state: dict[str, Any]) -> None:
+        """Continue from `training_state` of an algorithm with the same networks."""
+        self.policy.load_state_dict(state["policy"])
+        self.actor.optimizer.load_state_dict(state["actor_optimizer"])
+        self.critic.optimizer.load_state_dict(state["critic_optimizer"])
+        if self.auxiliary_critic is not None:
+            self.auxiliary_critic.load_training_state(state["auxiliary"])
+        assert self.replay_buffer is not None
+        self.moments.load_state_dict(state["moments"], self.replay_buffer)
+        self.rng.bit_generator.state = state["rng"]
+        if self._device_replay is not None and state["device_rng"] is not None:
+            self._device_replay.generator.set_state(state["device_rng"])
+        self._last_obs = state["last_obs"]
+        self._last_episode_starts = np.ones(self.n_envs, dtype=bool)
+        for name in self._COUNTERS:
+            setattr(self, name, state["counters"][name])
+
+    def expect_new_replay(self) -> None:
+        """Take in for the moments what is stored from now on: the replay buffer begins anew."""
+        assert self.replay_buffer is not None
+        self.moments.begin_anew(self.replay_buffer)
+
+    def _target_bounds(self) -> tuple[float, float]:
+        if self.target_clip == "auto":
+            return -1.0 / (1.0 - self.gamma), 0.0
+        if self.target_clip is None:
+            return -np.inf, np.inf
+        assert not isinstance(self.target_clip, str)  # no other word gets past __init__
+        low, high = self.target_clip
+        return float(low), float(high)
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """Take gradient steps; several batches are drawn from the buffer in one call."""
+        with matmul_at(self.matmul_precision), threads_at(self.update_threads):
+            self._train(gradient_steps, batch_size)
+
+    def _train(self, gradient_steps: int, batch_size: int) -> None:
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        auxiliary = self.auxiliary_critic
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        self._update_learning_rate(optimizers + ([auxiliary.optimizer] if auxiliary else []))
+        self._update_moments()
+        self._refresh_device_replay()
+        told: list[th.Tensor] = []
+        for n in self._chunks(gradient_steps, batch_size):
+            data, steps_to_goal = self._sample(n * batch_size, n)
+            if self._n_updates == 0 and self._device_replay is None:
+                self._check_rewards(data.rewards)
+            bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
+            # All networks share their input moments, so features are computed once.
+            chunk = Transitions(
+                data.observations,
+                data.actions,
+                data.next_observations,
+                self.actor.features_extractor(data.observations),
+                self.actor.features_extractor(data.next_observations),
+            )
+            told.append(self._updates.run(chunk, data.rewards, data.dones, bounds, batch_size))
+
+        # A plain mean until there are enough updates for the share to be left.
+        decay = min(self.average_decay**gradient_steps, 1.0 - gradient_steps / self._n_updates)
+        self.policy.update_average(decay if self.average_decay > 0.0 else 0.0)
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, value in zip(COLUMNS, th.cat(told).mean(dim=0).tolist(), strict=True):
+            self.logger.record(f"train/{name}", value)
+        for name, mean in (auxiliary.take_log() if auxiliary else {}).items():
+            self.logger.record(name, mean)
+        if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
+            self.logger.record("train/moved_share", self.replay_buffer.moved_share())
+            for name, value in self.replay_buffer.selection_log().items():
+                self.logger.record(name, value)
+
+    def _refresh_device_replay(self) -> None:
+        """Upload what is new; where that turns out to be impossible, go on on the host."""
+        if self._device_replay is None:
+            return
+        assert isinstance(self.replay_buffer, FollowObjectReplayBuffer)
+        try:
+            self._device_replay.refresh(self.replay_buffer)
+        except ValueError as error:
+            if self.replay_on_device:
+                raise
+            warnings.warn(f"Replay goes on on the host: {error}.", stacklevel=2)
+            self._device_replay = None
+
+    def _check_rewards(self, rewards: th.Tensor) -> None:
+        """Refuse rewards whose returns lie outside the bounds that "auto" stands for."""
+        if self.target_clip == "auto" and float(rewards.max()) > 0.0:
+            raise ValueError(
+                f"a reward is {float(rewards.max()):g}; target_clip 'auto' is for none above "
+                "0: give (low, high), the bounds of the returns, or None"
+            )
+
+    def _chunks(self, gradient_steps: int, batch_size: int) -> list[int]:
+        """Gradient steps whose batches are drawn in one call, in turn."""
+        most = _SAMPLE_CHUNK // batch_size
+        if self._device_replay is not None:
+            # Whole intervals, where they fit: chunks that move the targets alike share a graph.
+            most = _DEVICE_CHUNK // batch_size
+            most = most - most % self.target_update_interval or most
+        most = max(1, most)
+        return [min(most, gradient_steps - first) for first in range(0, gradient_steps, most)]
+
+    def _sample(self, n: int, n_batches: int = 1) -> tuple[DictReplayBufferSamples, th.Tensor]:
+        """Draw n transitions for so many batches, and (n, 1) steps until each goal was reached."""
+        buffer = self.replay_buffer
+        assert buffer is not None
+        if isinstance(buffer, FollowObjectReplayBuffer):
+            if self._device_replay is not None:
+                return self._device_replay.sample_with_steps(n)
+            return buffer.sample_with_steps(n, n_batches=n_batches)
+        data = buffer.sample(n)
+        return data, th.full((n, 1), th.inf, device=self.device)
+
+    def _trained_parameters(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
+        """Parameters of the live and of the target networks, in the same order."""
+        live: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
+        target: list[th.Tensor] = [
+            *self.actor_target.parameters(),
+            *self.critic_target.parameters(),
+        ]
+        if self.auxiliary_critic is not None:
+            live += self.auxiliary_critic.q_networks.parameters()
+            target += self.auxiliary_critic.target_networks.parameters()
+        return live, target
+
+
+def _is_interval(value: Any) -> bool:
+    """Whether a value is a pair of numbers in order."""
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        return False
+    return all(isinstance(limit, int | float) for limit in value) and value[0] <= value[1]

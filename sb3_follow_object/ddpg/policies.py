@@ -1,0 +1,142 @@
+"""Goal-conditioned actor and critic: normalised inputs, optional LayerNorm in the critic."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.td3.policies import TD3Policy
+from torch import nn
+
+from .layer_norm import LayerNorm
+
+
+class NormalizedGoalExtractor(BaseFeaturesExtractor):
+    """Observation and desired goal, standardised and clipped, as one vector.
+
+    The achieved goal is part of the observation already and is left out. The moments are buffers,
+    so they are saved with the policy and `predict` takes raw observations.
+
+    Args:
+        observation_space: Dict with "observation" and "desired_goal".
+        clip: bound on each standardised entry, in standard deviations.
+    """
+
+    mean: th.Tensor
+    std: th.Tensor
+
+    def __init__(self, observation_space: spaces.Dict, clip: float = 5.0):
+        self.keys = ("observation", "desired_goal")
+        dim = sum(get_flattened_obs_dim(observation_space[key]) for key in self.keys)
+        super().__init__(observation_space, dim)
+        self.clip = clip
+        self.register_buffer("mean", th.zeros(dim))
+        self.register_buffer("std", th.ones(dim))
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        """Map a batch of observations to features (n, features_dim)."""
+        inputs = th.cat([observations[key].float().flatten(1) for key in self.keys], dim=-1)
+        return ((inputs - self.mean) / self.std).clamp_(-self.clip, self.clip)
+
+
+class LayerNormCritic(ContinuousCritic):
+    """SB3's critic with LayerNorm after each hidden layer."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        for idx in range(self.n_critics):
+            layers: list[nn.Module] = []
+            for layer in self.q_networks[idx]:  # type: ignore[attr-defined]
+                layers.append(layer)
+                if isinstance(layer, nn.Linear) and layer.out_features > 1:
+                    layers.append(LayerNorm(layer.out_features))
+            q_net = nn.Sequential(*layers)
+            self.add_module(f"qf{idx}", q_net)
+            self.q_networks[idx] = q_net
+
+
+class HerPolicy(TD3Policy):
+    """Actor and critics of three layers of 256 on normalised observations and goals.
+
+    `predict` asks `actor_average`, a running average of the actor's weights, or the actor itself
+    unless `HerDDPG` is told to average; `actor` is the one that learns and explores.
+
+    Args:
+        critic_layer_norm: LayerNorm after each hidden layer of the critics. Beyond the paper.
+        features_clip: see `NormalizedGoalExtractor`.
+
+    The other arguments are TD3Policy's.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        critic_layer_norm: bool = False,
+        features_clip: float = 5.0,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ):
+        if kwargs.get("optimizer_class", th.optim.Adam) in (th.optim.Adam, th.optim.AdamW):
+            # One kernel for all parameters: the update is memory-bound otherwise.
+            optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
+        if "features_extractor_class" in kwargs:
+            raise ValueError(
+                "HerPolicy brings its own features extractor; leave features_extractor_class out"
+            )
+        self.critic_layer_norm = critic_layer_norm
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=[256, 256, 256] if net_arch is None else net_arch,
+            features_extractor_class=NormalizedGoalExtractor,
+            features_extractor_kwargs={"clip": features_clip},
+            optimizer_kwargs=optimizer_kwargs,
+            **kwargs,
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.actor_average = copy.deepcopy(self.actor)
+        del self.actor_average.optimizer
+        self.actor_average.requires_grad_(False)
+        self.actor_average.set_training_mode(False)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.actor_average(observation)
+
+    @th.no_grad()
+    def update_average(self, decay: float) -> None:
+        """Move the averaged actor towards the actor, keeping the share `decay` in [0, 1] of it."""
+        average: list[th.Tensor] = [*self.actor_average.parameters()]
+        live: list[th.Tensor] = [*self.actor.parameters()]
+        if decay == 0.0:  # exactly, to the last bit
+            th._foreach_copy_(average, live)
+        else:
+            th._foreach_lerp_(average, live, 1.0 - decay)
+
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> ContinuousCritic:
+        """Build one critic (or its target)."""
+        critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        critic_class = LayerNormCritic if self.critic_layer_norm else ContinuousCritic
+        return critic_class(**critic_kwargs).to(self.device)
+
+    def set_moments(self, mean: th.Tensor, std: th.Tensor) -> None:
+        """Give every network the same moments, (features_dim,) each."""
+        actors = (self.actor, self.actor_target, self.actor_average)
+        for net in (*actors, self.critic, self.critic_target):
+            extractor = net.features_extractor
+            assert isinstance(extractor, NormalizedGoalExtractor)
+            extractor.mean.copy_(mean)
+            extractor.std.copy_(std)

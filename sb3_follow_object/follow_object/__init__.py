@@ -1,0 +1,1 @@
+"""The three stages behind one `learn()` (Algorithm 1)."""

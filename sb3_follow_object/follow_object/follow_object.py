@@ -1,0 +1,408 @@
+"""Follow the Object: the three stages of the paper behind one `learn()`."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from ..callbacks.curriculum_callback import CurriculumCallback
+from ..callbacks.fresh_episodes import FreshEpisodes, begin_new_episodes
+from ..common.array_trees import load_tree, save_tree
+from ..common.files import atomic_write
+from ..common.reports import Report
+from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
+from ..common.seeds import stream_seed
+from ..ddpg.actor_files import save_actor
+from ..ddpg.her_ddpg import HerDDPG
+from ..envs import IDS, make_vec
+from ..envs.goal_envs import known_id
+from ..imagination.curriculum import Curriculum
+from ..imagination.goal_predictor import GoalPredictor
+from ..imagination.vec_env import ImaginedGoalVecEnv
+from ..object_stage.networks import FILE as OBJECT_FILE
+from ..object_stage.networks import ObjectNetworks
+from ..object_stage.sldr import reads_object_networks
+from ..object_stage.stage import ObjectStage
+from ..settings.keywords import with_tuples
+from .checks import check_algorithms, check_settings
+
+
+class FollowObject:
+    """Teach a robot a far goal by letting the object find the way first.
+
+    `learn()` runs the three stages of the paper (section 4): the object alone learns to reach the
+    goal; its paths train F_phi; the robot trains on original goals and on the goals that F_phi
+    imagines at growing distance.
+
+    Args:
+        env_id: a task of this package, e.g. "FollowObject/PnPShelf-v0".
+        imagine: False trains the robot on original goals only, i.e. DDPG + HER: no object stage.
+        predictor: an F_phi made before for this task; skips the first two stages.
+        object_networks: of an object stage made before for this task; needed beside `predictor`
+            where `algorithm` has the auxiliary reward "sldr", which reads them.
+        n_envs: parallel copies of the robot's environment, >= 1.
+        n_threads: of the simulation; by default as many as there are cores.
+        reward_type: "sparse" (paper) or "dense".
+        algorithm: keyword arguments of the robot's `HerDDPG`.
+        curriculum: keyword arguments of `Curriculum` besides the horizon.
+        object_algorithm: keyword arguments of the object's `HerDDPG`.
+        object_on_table: whether the object may not leave the table in the first stage; by default
+            where the gripper is blocked (Push tasks), so that the imagined goals can be reached by
+            pushing. The paper's object may always leave it.
+        object_n_envs: parallel copies of the object's environment, >= 1.
+        object_timesteps: env steps after which the object stage gives up.
+        n_paths: noise-free object paths that F_phi is fitted on.
+        predictor_fit: keyword arguments of `GoalPredictor.fit`.
+        inverse_fit: keyword arguments of `ObjectNetworks.learned`, about the inverse model.
+        test_every: rollouts of every copy between two tests at k_max.
+        n_test_episodes: episodes a test; by default `n_envs`.
+        store_tests: whether the episodes of the tests enter the replay buffer.
+        seed: decides the whole run.
+        report: called with a sentence as stages begin and end.
+
+    Attributes:
+        object_stage: the first two stages, what they learned and what they cost.
+        model: the robot's `HerDDPG`, once the third stage has begun.
+
+    Raises:
+        ValueError: unknown task, a predictor made for another one, or an argument out of range.
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        *,
+        imagine: bool = True,
+        predictor: GoalPredictor | None = None,
+        object_networks: ObjectNetworks | None = None,
+        n_envs: int = 16,
+        n_threads: int | None = None,
+        reward_type: str = "sparse",
+        algorithm: dict[str, Any] | None = None,
+        curriculum: dict[str, Any] | None = None,
+        object_algorithm: dict[str, Any] | None = None,
+        object_on_table: bool | None = None,
+        object_n_envs: int = 16,
+        object_timesteps: int = 400_000,
+        n_paths: int = 512,
+        predictor_fit: dict[str, Any] | None = None,
+        inverse_fit: dict[str, Any] | None = None,
+        test_every: int = 4,
+        n_test_episodes: int | None = None,
+        store_tests: bool = True,
+        seed: int = 0,
+        report: Report | None = None,
+    ):
+        full_id, env_id = env_id, known_id(env_id)
+        self.settings: dict[str, Any] = {
+            "env_id": env_id,
+            "imagine": imagine,
+            "n_envs": n_envs,
+            "n_threads": n_threads,
+            "reward_type": reward_type,
+            "algorithm": dict(algorithm or {}),
+            "curriculum": dict(curriculum or {}),
+            "object_algorithm": dict(object_algorithm or {}),
+            "object_on_table": object_on_table,
+            "object_n_envs": object_n_envs,
+            "object_timesteps": object_timesteps,
+            "n_paths": n_paths,
+            "predictor_fit": dict(predictor_fit or {}),
+            "inverse_fit": dict(inverse_fit or {}),
+            "test_every": test_every,
+            "n_test_episodes": n_envs if n_test_episodes is None else n_test_episodes,
+            "store_tests": store_tests,
+            "seed": seed,
+        }
+        check_settings(self.settings)
+        self.env_id = env_id
+        self.full_id = full_id  # with the module that registers it, as given
+        self.imagine = imagine
+        self.seed = seed
+        self.report = report or (lambda sentence: None)
+        self.object_stage = ObjectStage(
+            self.settings, self.report, needs_networks=reads_object_networks(algorithm or {})
+        )
+        self.env: VecEnv = self._robot_env("robot")
+        self.horizon = int(self.env.get_attr("spec", indices=[0])[0].max_episode_steps)
+        self.curriculum = Curriculum(self.horizon, **self.settings["curriculum"])
+        self._checked = False
+        self.model: HerDDPG | None = None
+        self.curriculum_callback: CurriculumCallback | None = None
+        if predictor is not None:
+            self.object_stage.use_predictor(predictor)
+        if object_networks is not None:
+            self.object_stage.use_networks(object_networks)
+        elif self.object_stage.needs_networks and predictor is not None:
+            raise ValueError(
+                "the auxiliary reward 'sldr' needs the object's networks beside the predictor; "
+                f"give those of the same object stage ({OBJECT_FILE}), or neither"
+            )
+
+    @classmethod
+    def from_preset(
+        cls,
+        env_id: str,
+        *,
+        method: str = "fo",
+        preset: str = "default",
+        seed: int = 0,
+        overrides: Mapping[str, Any] | None = None,
+        **arguments: Any,
+    ) -> FollowObject:
+        """Return one with the settings that `sb3-follow-object train` takes for a task.
+
+        Args:
+            env_id: the task.
+            method: one of `METHODS`.
+            preset: "default", what was measured to be best, or "paper", the authors' settings.
+            seed: decides the whole run.
+            overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win. Those
+                of a run folder (n_timesteps, eval_every and the like) mean nothing here.
+            **arguments: of the class, which are no settings: predictor, object_networks, report.
+
+        Raises:
+            ValueError: an id, a key or a value that cannot be meant, with the nearest that can.
+        """
+        from ..settings.presets import run_config
+
+        config = run_config(env_id, method=method, preset=preset, seed=seed, overrides=overrides)
+        return cls(env_id, seed=seed, **config.settings, **arguments)
+
+    @property
+    def has_object_stage(self) -> bool:
+        """Whether the object learns first, for imagined goals or for SLDR."""
+        return self.imagine or self.object_stage.needs_networks
+
+    @property
+    def predictor(self) -> GoalPredictor | None:
+        """F_phi, once the second stage has ended."""
+        return self.object_stage.predictor
+
+    @property
+    def object_steps(self) -> int:
+        """Env steps that the first two stages cost."""
+        return self.object_stage.steps
+
+    # ---- stage three --------------------------------------------------------------------------
+
+    @property
+    def env_steps(self) -> int:
+        """Env steps so far: the object's, the robot's and those of the curriculum's tests."""
+        return self.object_steps + (self.model.num_timesteps if self.model else 0)
+
+    @property
+    def test_steps(self) -> int:
+        """Env steps of the curriculum's tests, part of `env_steps`."""
+        return self.curriculum_callback.test_steps if self.curriculum_callback else 0
+
+    def check(self) -> None:
+        """Raise a ValueError for a setting that a later stage would fail on."""
+        if not self._checked:
+            check_algorithms(self.settings, self.env, self.object_stage.needs_networks)
+            self._checked = True
+
+    def prepare(self) -> HerDDPG:
+        """Run the stages that are missing before the robot can train; build its algorithm."""
+        if self.model is not None:
+            return self.model
+        self.check()
+        if self.imagine:
+            predictor = self.predictor or self.object_stage.learn_predictor()
+            test_env = self._robot_env("test")
+            self.env = ImaginedGoalVecEnv(self.env, predictor, self.curriculum)
+            test_env = ImaginedGoalVecEnv(test_env, predictor, self.curriculum, mode="test")
+            test_env.seed(stream_seed(self.seed, "test"))
+            self.curriculum_callback = CurriculumCallback(
+                test_env,
+                self.settings["n_test_episodes"],
+                every=self.settings["test_every"],
+                store=self.settings["store_tests"],
+            )
+        arguments: dict[str, Any] = {"policy": "MultiInputPolicy", **self.settings["algorithm"]}
+        stage = self.object_stage
+        if stage.needs_networks:
+            if stage.networks is None:
+                stage.learn_policy()
+            networks = {"object_networks": stage.networks}
+            arguments["auxiliary"] = {**arguments["auxiliary"], **networks}
+        self.model = HerDDPG(env=self.env, seed=stream_seed(self.seed, "networks"), **arguments)
+        if self.imagine and self.predictor is not None:
+            self.predictor.to(self.model.device)  # it imagines the goals of all copies at once
+        # SB3 seeds the environment too; a run's streams are its own.
+        self.env.seed(stream_seed(self.seed, "robot"))
+        return self.model
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = None,
+        progress_bar: bool = False,
+    ) -> FollowObject:
+        """Train until `env_steps` reaches `total_timesteps`; may be called again with more.
+
+        Args:
+            total_timesteps: env steps in all, object stage and tests included.
+            callback: of SB3, called while the robot trains.
+            log_interval: episodes between two log lines of SB3.
+            progress_bar: SB3's.
+        """
+        model = self.prepare()
+        remaining = total_timesteps - self.env_steps
+        if remaining <= 0:
+            return self
+        callbacks: list[BaseCallback] = []
+        if env_state(self.env) is None:
+            callbacks.append(FreshEpisodes(lambda n: stream_seed(self.seed, f"robot {n}")))
+        if self.curriculum_callback is not None:
+            callbacks.append(self.curriculum_callback)
+        if isinstance(callback, list):
+            callbacks += callback
+        elif isinstance(callback, BaseCallback):
+            callbacks.append(callback)
+        elif callback is not None:
+            callbacks.append(ConvertCallback(callback))
+        model.learn(
+            remaining,
+            callback=CallbackList(callbacks),
+            log_interval=log_interval,  # type: ignore[arg-type]
+            reset_num_timesteps=False,
+            progress_bar=progress_bar,
+        )
+        return self
+
+    def predict(
+        self, observation: dict[str, np.ndarray], deterministic: bool = True
+    ) -> tuple[np.ndarray, None]:
+        """Return the robot's actions, as SB3's `predict`."""
+        if self.model is None:
+            raise ValueError("nothing has been learned yet: call learn() first")
+        return self.model.predict(observation, deterministic=deterministic)  # type: ignore
+
+    # ---- saving -------------------------------------------------------------------------------
+
+    def state_dict(self, replay_buffer: bool = True) -> dict[str, Any]:
+        """Return what `learn` has changed, at an episode's end of every copy."""
+        state: dict[str, Any] = {
+            "object_steps": self.object_steps,
+            "object_success": self.object_stage.success,
+            "curriculum": self.curriculum.state_dict(),
+        }
+        if self.model is not None:
+            state["model"] = self.model.training_state()
+            state["env"] = env_state(self.env)
+            state["generators"] = global_generators()
+            if self.curriculum_callback is not None:
+                state["callback"] = self.curriculum_callback.state_dict()
+                state["test_env"] = env_state(self.curriculum_callback.test_env)
+            if replay_buffer:
+                assert self.model.replay_buffer is not None
+                state["replay_buffer"] = self.model.replay_buffer.state_dict()
+        return state
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`; the predictor must have been given already."""
+        self.object_stage.steps = state["object_steps"]
+        self.object_stage.success = state["object_success"]
+        self.curriculum.load_state_dict(state["curriculum"])
+        if "model" not in state:
+            return
+        model = self.prepare()
+        model.load_training_state(state["model"])
+        set_env_state(self.env, state["env"])
+        if self.curriculum_callback is not None:
+            self.curriculum_callback.load_state_dict(state["callback"])
+            set_env_state(self.curriculum_callback.test_env, state["test_env"])
+        if "replay_buffer" in state:
+            assert model.replay_buffer is not None
+            model.replay_buffer.load_state_dict(state["replay_buffer"])
+        else:
+            model.expect_new_replay()
+        if state["env"] is None:
+            begin_new_episodes(model)
+        set_global_generators(state["generators"])
+
+    def save(self, folder: str | os.PathLike[str], replay_buffer: bool = True) -> None:
+        """Save everything to a folder: settings, predictor and training state.
+
+        Args:
+            folder: is created; files of an earlier save are replaced.
+            replay_buffer: False makes a small save that can act and train on, from empty replay.
+
+        Raises:
+            ValueError: a setting is a Python object, which a save does not hold.
+        """
+        try:
+            saved = {**self.settings, "env_id": self.full_id}
+            settings = json.dumps(saved, indent=2).encode()
+        except TypeError as error:
+            raise ValueError(f"these settings cannot be saved: {error}") from error
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        if self.predictor is not None:
+            self.predictor.save(folder / "predictor")
+        elif (folder / "predictor").exists():
+            shutil.rmtree(folder / "predictor")
+        if self.object_stage.networks is not None:
+            self.object_stage.networks.save(folder / OBJECT_FILE)
+        else:
+            (folder / OBJECT_FILE).unlink(missing_ok=True)
+        save_tree(folder / "state.safetensors", self.state_dict(replay_buffer))
+        atomic_write(folder / "settings.json", settings)
+
+    @classmethod
+    def load(cls, folder: str | os.PathLike[str], report: Report | None = None) -> FollowObject:
+        """Restore what `save` wrote; training goes on exactly where it stopped.
+
+        Raises:
+            ValueError: the folder holds no save, or one that is damaged.
+        """
+        folder = Path(folder)
+        try:
+            settings = with_tuples(json.loads((folder / "settings.json").read_text()))
+            env_id = known_id(settings["env_id"])
+            predictor = None
+            if (folder / "predictor").exists():
+                predictor = GoalPredictor.load(folder / "predictor", env_id=env_id)
+            networks = None
+            if (folder / OBJECT_FILE).exists():
+                networks = ObjectNetworks.load(folder / OBJECT_FILE, env_id=env_id)
+            run = cls(**settings, predictor=predictor, object_networks=networks, report=report)
+            run.load_state_dict(load_tree(folder / "state.safetensors"))
+            return run
+        except (OSError, KeyError, RecursionError, TypeError, ValueError) as error:
+            raise ValueError(f"{folder} holds no saved FollowObject ({error})") from error
+
+    def save_policy(self, path: str | os.PathLike[str]) -> None:
+        """Save the actor that `predict` uses alone: a small file that `load_actor` reads."""
+        if self.model is None:
+            raise ValueError("nothing has been learned yet: call learn() first")
+        save_actor(path, self.model.policy.actor_average, self.env_id)
+
+    def close(self) -> None:
+        """Close all environments."""
+        self.env.close()
+        if self.curriculum_callback is not None:
+            self.curriculum_callback.test_env.close()
+
+    def _robot_env(self, purpose: str) -> VecEnv:
+        reward_type = self.settings["reward_type"]
+        # Environments of others need not know the word; theirs are sparse unless asked.
+        options = (
+            {}
+            if self.env_id not in IDS and reward_type == "sparse"
+            else {"reward_type": reward_type}
+        )
+        env = make_vec(self.env_id, self.settings["n_envs"], self.settings["n_threads"], **options)
+        env.seed(stream_seed(self.seed, purpose))
+        return env

@@ -1,0 +1,60 @@
+"""What an environment must have so that imagined goals can be shown in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+from gymnasium import spaces
+
+from .curriculum import Curriculum
+from .goal_predictor import GoalPredictor
+from .predictor_files import POSITION
+
+Observation = dict[str, np.ndarray]
+
+SUCCESS_METHODS = ("is_success", "_is_success")  # ours, and gymnasium-robotics'
+STREAM = 0x60A1  # parts the goals' random numbers from those of the environment's own seed
+
+
+def check_horizons(predictor: GoalPredictor, curriculum: Curriculum) -> None:
+    """Raise a ValueError unless both have the same T."""
+    if predictor.horizon != curriculum.horizon:
+        raise ValueError(
+            f"The predictor imagines {predictor.horizon} steps, "
+            f"but the curriculum has horizon {curriculum.horizon}."
+        )
+
+
+def checked_goals(space: spaces.Space, has: Callable[[str], bool]) -> np.dtype[Any]:
+    """Refuse what cannot be wrapped; return the dtype of goals."""
+    keys = set(space.spaces) if isinstance(space, spaces.Dict) else set()
+    missing = {"observation", "achieved_goal", "desired_goal"} - keys
+    if missing:
+        raise ValueError(
+            f"Imagined goals need an environment with Dict goal observations, "
+            f"this one lacks {sorted(missing)}."
+        )
+    goals = cast(spaces.Dict, space)["desired_goal"]
+    if goals.shape != (POSITION,) or goals.dtype is None:
+        raise ValueError(
+            f"Imagined goals are object positions of shape (3,), "
+            f"this environment's goals have the shape {goals.shape}."
+        )
+    if not has("compute_reward"):
+        raise ValueError(
+            "Imagined goals need an environment with compute_reward(achieved, desired, info), "
+            "this one has none."
+        )
+    return goals.dtype
+
+
+def success_method(has: Callable[[str], bool]) -> str:
+    """Return the name of the environment's method that judges any goal."""
+    for name in SUCCESS_METHODS:
+        if has(name):
+            return name
+    raise ValueError(
+        "Imagined goals need an environment with is_success(achieved, desired), this one has none."
+    )

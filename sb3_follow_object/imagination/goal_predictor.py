@@ -1,0 +1,387 @@
+"""F_phi: the object's position k steps ahead on its way from o_1 to g (paper, section 4.2)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+from stable_baselines3.common.utils import get_device
+from torch import nn
+
+from ..common.files import atomic_write
+from .predictor_files import (
+    FACTS_FILE,
+    FORMAT,
+    INPUTS,
+    LAYERS_LIMIT,
+    POSITION,
+    SCALES,
+    TENSORS_FILE,
+    WIDTH_LIMIT,
+    checked_facts,
+    checked_tensors,
+    valid_hidden,
+)
+
+# Metres. The start's height is the same in all paths up to the solver's noise; divided by that
+# noise, half a millimetre in the robot's scene would be an input that the network has never seen.
+SMALLEST_STD = 1e-2
+
+Progress = Callable[[int, float], None]
+
+
+class GoalPredictor:
+    """A network that imagines where the object would be after k steps (paper, section 4.2).
+
+    Made by ``fit`` or ``load``.
+
+    Attributes:
+        horizon: T, the largest k.
+        env_id: gymnasium id of the task that it was made for.
+        physics: short hash of the physics that it was made for.
+        object_on_table: whether the object was kept on the table; None where that is not known.
+        error_mm: mean distance to the held-out paths for each k in 1..T, shape (T,), millimetres.
+        device: that it imagines on, the CPU unless `to` says another.
+    """
+
+    def __init__(
+        self,
+        tensors: dict[str, torch.Tensor],
+        *,
+        hidden: Sequence[int],
+        horizon: int,
+        env_id: str,
+        physics: str,
+        error_mm: np.ndarray,
+        object_on_table: bool | None = None,
+    ) -> None:
+        self.hidden = tuple(hidden)
+        self.horizon = horizon
+        self.env_id = env_id
+        self.physics = physics
+        self.object_on_table = object_on_table
+        self.error_mm = error_mm
+        self.device = torch.device("cpu")
+        self._tensors = tensors
+        self._network = _network(self.hidden)
+        self._network.load_state_dict(
+            {name: value for name, value in tensors.items() if name not in SCALES}
+        )
+        self._network.eval()
+        # Copies: torch moves a tensor's memory when it is sent to another process.
+        self._scales = {name: tensors[name].numpy().copy() for name in SCALES}
+
+    @classmethod
+    def fit(
+        cls,
+        paths: np.ndarray,
+        goals: np.ndarray,
+        *,
+        env_id: str,
+        physics: str,
+        object_on_table: bool | None = None,
+        hidden: Sequence[int] = (512, 512, 512),
+        learning_rate: float = 1e-3,
+        batch_size: int = 128,
+        epochs: int = 30,
+        test_share: float = 0.3,
+        seed: int = 0,
+        device: str = "auto",
+        progress: Progress | None = None,
+    ) -> GoalPredictor:
+        """Fit F_phi to paths of the object policy by mean squared error (paper, equation 3).
+
+        Whole paths are held out, so ``error_mm`` says how well unseen starts and goals are met.
+        The result depends on ``seed`` and the device's kind alone and no global random state is
+        touched.
+
+        Args:
+            paths: object positions o_1..o_{T+1} of n episodes, shape (n, T+1, 3), metres.
+            goals: their goals g, shape (n, 3), metres.
+            env_id: gymnasium id of the task, kept with the predictor.
+            physics: hash of the task's physics, kept with the predictor.
+            object_on_table: whether the object was kept on the table, kept with the predictor.
+            hidden: widths of the hidden layers, each >= 1.
+            learning_rate: of Adam, > 0.
+            batch_size: samples an update, >= 1.
+            epochs: passes over the training samples, >= 1.
+            test_share: share of the paths that is held out, in (0, 1).
+            seed: of the split, the weights and the order of the samples.
+            device: of PyTorch that the fit is done on; "auto" is a GPU where there is one.
+            progress: called after each epoch with its number from 1 and its mean loss, the
+                squared error per coordinate in units of the paths' variance.
+
+        Raises:
+            ValueError: an argument has a wrong shape or range, or holds NaN or infinity.
+        """
+        paths, goals = _checked_paths(paths, goals)
+        cls.check_fit(hidden, learning_rate, batch_size, epochs, test_share, device)
+        n, horizon = len(paths), paths.shape[1] - 1
+        n_test = min(max(round(test_share * n), 1), n - 1)
+        generator = torch.Generator().manual_seed(seed)
+        order = torch.randperm(n, generator=generator).numpy()
+        test, train = order[:n_test], order[n_test:]
+
+        inputs, targets = _samples(paths[train], goals[train])
+        tensors = {
+            "input_mean": torch.from_numpy(inputs.mean(axis=0)),
+            "input_std": torch.from_numpy(np.maximum(inputs.std(axis=0), SMALLEST_STD)),
+            "output_mean": torch.from_numpy(targets.mean(axis=0)),
+            "output_std": torch.from_numpy(np.maximum(targets.std(axis=0), SMALLEST_STD)),
+        }
+        network = _network(hidden)
+        _initialise(network, generator)
+        x = (torch.from_numpy(inputs) - tensors["input_mean"]) / tensors["input_std"]
+        y = (torch.from_numpy(targets) - tensors["output_mean"]) / tensors["output_std"]
+        on = get_device(device)
+        _train(
+            network.to(on),
+            x.float().to(on),
+            y.float().to(on),
+            learning_rate=learning_rate,
+            batch_size=batch_size,
+            epochs=epochs,
+            generator=generator,
+            progress=progress,
+        )
+        weights = network.cpu().state_dict()
+        tensors |= {name: value.detach().clone() for name, value in weights.items()}
+        predictor = cls(
+            tensors,
+            hidden=hidden,
+            horizon=horizon,
+            env_id=env_id,
+            physics=physics,
+            object_on_table=object_on_table,
+            error_mm=np.full(horizon, np.nan),
+        )
+        imagined = predictor.paths(paths[test, 0], goals[test])
+        distance = np.linalg.norm(imagined[:, 1:] - paths[test, 1:], axis=2)
+        predictor.error_mm = 1000.0 * distance.mean(axis=0)
+        return predictor
+
+    @staticmethod
+    def check_fit(
+        hidden: Sequence[int] = (512, 512, 512),
+        learning_rate: float = 1e-3,
+        batch_size: int = 128,
+        epochs: int = 30,
+        test_share: float = 0.3,
+        device: str = "auto",
+    ) -> None:
+        """Raise a ValueError unless `fit` can do with these arguments."""
+        if not valid_hidden(list(hidden)):
+            raise ValueError(
+                f"hidden must be 1 to {LAYERS_LIMIT} widths in 1..{WIDTH_LIMIT}, got {hidden!r}."
+            )
+        if not 0.0 < learning_rate < np.inf:
+            raise ValueError(f"learning_rate must be > 0 and finite, got {learning_rate!r}.")
+        if batch_size < 1 or epochs < 1:
+            raise ValueError(
+                f"batch_size and epochs must be >= 1, got {batch_size!r} and {epochs!r}."
+            )
+        if not 0.0 < test_share < 1.0:
+            raise ValueError(f"test_share must lie between 0 and 1, got {test_share!r}.")
+        try:
+            get_device(device)
+        except RuntimeError as error:
+            raise ValueError(f"device {device!r} cannot be used: {error}") from error
+
+    def to(self, device: torch.device | str) -> GoalPredictor:
+        """Imagine on this device from now on; what `save` writes stays the same."""
+        self.device = torch.device(device)
+        self._network.to(self.device)
+        return self
+
+    def predict(self, start: np.ndarray, goal: np.ndarray, k: np.ndarray) -> np.ndarray:
+        """Return the imagined position at time-step k + 1, F_phi(o_1, g, k).
+
+        Args:
+            start: object positions o_1, shape (n, 3), metres.
+            goal: goals g, shape (n, 3), metres.
+            k: steps ahead, shape (n,) int, in 1..T.
+
+        Returns:
+            positions, shape (n, 3) float64, metres.
+
+        Raises:
+            ValueError: a shape is wrong or a k lies outside 1..T.
+        """
+        start, goal, k = np.asarray(start), np.asarray(goal), np.asarray(k)
+        n = len(k) if k.ndim == 1 else -1
+        if start.shape != (n, POSITION) or goal.shape != (n, POSITION):
+            raise ValueError(
+                f"start, goal and k must have the shapes (n, 3), (n, 3) and (n,), "
+                f"got {start.shape}, {goal.shape} and {k.shape}."
+            )
+        if n and not (k.min() >= 1 and k.max() <= self.horizon):
+            raise ValueError(
+                f"k must lie in 1..{self.horizon}, got values from {k.min()} to {k.max()}."
+            )
+        inputs = np.concatenate([start, goal, k[:, None]], axis=1, dtype=np.float64)
+        scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
+        with torch.inference_mode():
+            on = torch.from_numpy(scaled.astype(np.float32)).to(self.device)
+            outputs = self._network(on).cpu().numpy()
+        return outputs * self._scales["output_std"] + self._scales["output_mean"]
+
+    def paths(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Return whole imagined paths, o_1 and then F_phi for k = 1..T.
+
+        Args:
+            start: object positions o_1, shape (n, 3), metres.
+            goal: goals g, shape (n, 3), metres.
+
+        Returns:
+            paths, shape (n, T+1, 3) float64, metres.
+        """
+        start, goal = np.asarray(start, dtype=np.float64), np.asarray(goal, dtype=np.float64)
+        ahead = self.predict(
+            np.repeat(start, self.horizon, axis=0),
+            np.repeat(goal, self.horizon, axis=0),
+            np.tile(np.arange(1, self.horizon + 1), len(start)),
+        )
+        return np.concatenate([start[:, None], ahead.reshape(-1, self.horizon, POSITION)], axis=1)
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write ``predictor.safetensors`` and ``predictor.json`` into ``folder``.
+
+        The facts come last and name the tensors' digest, so a pair that does not belong together
+        is noticed when it is loaded.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        tensors = safetensors.torch.save(self._tensors)
+        facts = {
+            "format": FORMAT,
+            "env_id": self.env_id,
+            "physics": self.physics,
+            "object_on_table": self.object_on_table,
+            "horizon": self.horizon,
+            "hidden": list(self.hidden),
+            "error_mm": self.error_mm.tolist(),
+            "sha256": hashlib.sha256(tensors).hexdigest(),
+        }
+        atomic_write(folder / TENSORS_FILE, tensors)
+        atomic_write(folder / FACTS_FILE, json.dumps(facts, indent=1).encode())
+
+    @classmethod
+    def load(
+        cls,
+        folder: str | os.PathLike[str],
+        env_id: str | None = None,
+        physics: str | None = None,
+        object_on_table: bool | None = None,
+    ) -> GoalPredictor:
+        """Read a predictor that ``save`` wrote.
+
+        Args:
+            folder: holds the two files.
+            env_id: the task that it is wanted for; None accepts any.
+            physics: the physics that it is wanted for; None accepts any.
+            object_on_table: whether the object should have been kept on the table; None accepts
+                both, and a predictor that does not say is accepted always.
+
+        Raises:
+            ValueError: a file is missing, damaged or oversized, or the predictor was made for
+                another task, other physics or another object_on_table.
+        """
+        folder = Path(folder)
+        facts = checked_facts(folder / FACTS_FILE)
+        wanted = {"env_id": env_id, "physics": physics}
+        for name, value in wanted.items():
+            if value is not None and facts[name] != value:
+                raise ValueError(
+                    f"The predictor in {folder} was made for {name} {facts[name]!r}, "
+                    f"not for {value!r}: fit one for that task."
+                )
+        made = facts.get("object_on_table")
+        if None not in (made, object_on_table) and made != object_on_table:
+            raise ValueError(
+                f"The predictor in {folder} was made with object_on_table={made}, "
+                f"not {object_on_table}: fit one with that setting."
+            )
+        tensors = checked_tensors(folder / TENSORS_FILE, facts["hidden"], facts["sha256"])
+        return cls(
+            tensors,
+            hidden=facts["hidden"],
+            horizon=facts["horizon"],
+            env_id=facts["env_id"],
+            physics=facts["physics"],
+            object_on_table=made,
+            error_mm=np.array(facts["error_mm"], dtype=np.float64),
+        )
+
+
+def _network(hidden: Sequence[int]) -> nn.Sequential:
+    """Return the network with its weights unset: setting them here would use the global RNG."""
+    widths = [INPUTS, *hidden]
+    layers: list[nn.Module] = []
+    for n_in, n_out in pairwise(widths):
+        layers += [nn.utils.skip_init(nn.Linear, n_in, n_out), nn.ReLU()]
+    layers.append(nn.utils.skip_init(nn.Linear, widths[-1], POSITION))
+    return nn.Sequential(*layers)
+
+
+def _initialise(network: nn.Sequential, generator: torch.Generator) -> None:
+    """Draw the weights as nn.Linear does by default, from ``generator``."""
+    for layer in network:
+        if isinstance(layer, nn.Linear):
+            bound = layer.in_features**-0.5
+            nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
+            nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
+
+
+def _samples(paths: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return inputs (n * T, 7) and targets (n * T, 3) for every path and every k in 1..T."""
+    n, horizon = len(paths), paths.shape[1] - 1
+    fixed = np.repeat(np.concatenate([paths[:, 0], goals], axis=1), horizon, axis=0)
+    k = np.tile(np.arange(1.0, horizon + 1), n)[:, None]
+    return np.concatenate([fixed, k], axis=1), paths[:, 1:].reshape(-1, POSITION)
+
+
+def _train(
+    network: nn.Sequential,
+    inputs: torch.Tensor,
+    targets: torch.Tensor,
+    *,
+    learning_rate: float,
+    batch_size: int,
+    epochs: int,
+    generator: torch.Generator,
+    progress: Progress | None,
+) -> None:
+    optimiser = torch.optim.Adam(network.parameters(), lr=learning_rate)
+    for epoch in range(1, epochs + 1):
+        order = torch.randperm(len(inputs), generator=generator).to(inputs.device)
+        total = torch.zeros((), device=inputs.device)
+        for x, y in zip(
+            inputs[order].split(batch_size), targets[order].split(batch_size), strict=True
+        ):
+            loss = nn.functional.mse_loss(network(x), y)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            total += loss.detach() * len(x)
+        if progress is not None:
+            progress(epoch, float(total) / len(inputs))
+
+
+def _checked_paths(paths: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    paths, goals = np.asarray(paths, dtype=np.float64), np.asarray(goals, dtype=np.float64)
+    if paths.ndim != 3 or len(paths) < 2 or paths.shape[1] < 2 or paths.shape[2] != POSITION:
+        raise ValueError(
+            f"paths must have the shape (n, T+1, 3) with n >= 2 and T >= 1, got {paths.shape}."
+        )
+    if goals.shape != (len(paths), POSITION):
+        raise ValueError(f"goals must have the shape ({len(paths)}, 3), got {goals.shape}.")
+    if not (np.isfinite(paths).all() and np.isfinite(goals).all()):
+        raise ValueError("paths and goals must be finite, got NaN or infinity in them.")
+    return paths, goals

@@ -1,0 +1,207 @@
+"""Imagined goals in a vectorised environment (paper, section 4.3).
+
+The shown goal stands in every observation, in the reward and in ``is_success``; the original one
+stays in the info. So a replay buffer around a wrapper stores what the policy saw.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from .curriculum import Curriculum
+from .goal_env import STREAM, Observation, check_horizons, checked_goals, success_method
+from .goal_predictor import GoalPredictor
+from .imagined_goals import draw_goals, imagine
+from .predictor_files import POSITION
+
+MODES = ("train", "test")
+SHARED = ("predictor", "curriculum")  # what all copies of a vectorised environment share
+
+
+class ImaginedGoalVecEnv(VecEnvWrapper):
+    """Show imagined goals in a vectorised environment (paper, Algorithm 1).
+
+    Observations, infos and the ends of episodes are those of ``ImaginedGoalWrapper``, and
+    ``terminal_observation`` carries the shown goal too. Put VecMonitor outside, so that returns
+    are those of the shown goals.
+
+    Args:
+        venv: vectorised environment with Dict goal observations; ``compute_reward`` and the
+            success method of its first copy must accept batches of goals.
+        predictor: F_phi.
+        curriculum: its k_max is read when an episode starts; share it with the test environment.
+        mode: "train" draws original or imagined goals; "test" shows h_max, the imagined goal of
+            level k_max, in every episode.
+
+    Raises:
+        ValueError: as ``ImaginedGoalWrapper``, or an unknown mode.
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        predictor: GoalPredictor,
+        curriculum: Curriculum,
+        mode: str = "train",
+    ) -> None:
+        if mode not in MODES:
+            raise ValueError(f"mode must be one of {list(MODES)}, got {mode!r}.")
+        super().__init__(venv)
+        self._dtype = checked_goals(venv.observation_space, venv.has_attr)
+        check_horizons(predictor, curriculum)
+        self._success_method = success_method(venv.has_attr)
+        self.predictor = predictor
+        self.curriculum = curriculum
+        self.mode = mode
+        self._rng = np.random.default_rng()
+        self._shown = np.zeros((venv.num_envs, POSITION), self._dtype)
+        self._original = self._shown.copy()
+        self._level = np.zeros(venv.num_envs, dtype=np.int64)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the environments and the draw of goals; takes effect at the next reset."""
+        seeds = self.venv.seed(seed)
+        first = seed if seed is not None else seeds[0]
+        self._rng = np.random.default_rng(None if first is None else [first, STREAM])
+        return seeds
+
+    def reset(self) -> Observation:
+        """Start an episode in every copy and draw the goals."""
+        obs = cast(Observation, self.venv.reset())
+        self._draw(np.arange(self.num_envs), obs)
+        self.reset_infos = [
+            {**info, **facts}
+            for info, facts in zip(self.venv.reset_infos, self._facts(), strict=True)
+        ]
+        return self._relabel(obs)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Finish the step; rewards and success are those of the shown goals."""
+        venv_obs, rewards, dones, infos = self.venv.step_wait()
+        obs = cast(Observation, venv_obs)
+        ended = np.flatnonzero(dones)
+        achieved = np.array(obs["achieved_goal"])
+        for i in ended:
+            achieved[i] = infos[i]["terminal_observation"]["achieved_goal"]
+
+        imagined = np.flatnonzero(self._level)
+        if imagined.size:
+            rewards = rewards.copy()
+            rewards[imagined] = self._ask(
+                "compute_reward",
+                achieved[imagined],
+                self._shown[imagined],
+                [infos[i] for i in imagined],
+            )
+        success, original_success = (
+            self._ask(
+                self._success_method,
+                np.concatenate([achieved, achieved]),
+                np.concatenate([self._shown, self._original]),
+            )
+            .astype(bool)
+            .reshape(2, -1)
+        )
+        infos = [
+            {**info, **facts, "is_success": reached, "original_success": original_reached}
+            for info, facts, reached, original_reached in zip(
+                infos, self._facts(), success.tolist(), original_success.tolist(), strict=True
+            )
+        ]
+        for i in ended:
+            last = infos[i]["terminal_observation"]
+            infos[i]["terminal_observation"] = {**last, "desired_goal": self._shown[i].copy()}
+        if ended.size:
+            self._draw(ended, obs)
+        return self._relabel(obs), rewards, dones, infos
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether ``get_attr`` has an answer."""
+        return attr_name in SHARED or super().has_attr(attr_name)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return an attribute of the copies; predictor and curriculum are the same for all."""
+        if attr_name in SHARED:
+            return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+        return super().get_attr(attr_name, indices)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the goals, the generator's state and, where it offers one, the inner state.
+
+        Only with an inner state can running episodes be continued by ``set_state``; without one,
+        reset after it. The curriculum, shared with others, is not part of it.
+        """
+        state = {
+            "shown": self._shown.copy(),
+            "original": self._original.copy(),
+            "level": self._level.copy(),
+            "rng": copy.deepcopy(self._rng.bit_generator.state),
+        }
+        if hasattr(self.venv, "get_state"):
+            state["venv"] = self.venv.get_state()
+        return state
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Continue from ``get_state`` of a wrapper of the same size."""
+        for name in ("shown", "original", "level"):
+            current, saved = getattr(self, f"_{name}"), np.asarray(state[name])
+            if saved.shape != current.shape:
+                raise ValueError(
+                    f"The state was saved for {len(saved)} environments, this one has "
+                    f"{self.num_envs}."
+                )
+            setattr(self, f"_{name}", saved.astype(current.dtype))
+        self._rng.bit_generator.state = state["rng"]
+        if "venv" in state:
+            self.venv.set_state(state["venv"])  # type: ignore[attr-defined]
+
+    def _draw(self, rows: np.ndarray, obs: Observation) -> None:
+        """Give the episodes that start in ``rows`` their goals."""
+        start, goal = obs["achieved_goal"][rows], obs["desired_goal"][rows]
+        if self.mode == "test":
+            level = np.full(len(rows), self.curriculum.k_max)
+            shown = imagine(self.predictor, self.curriculum, start, goal, level)
+        else:
+            shown, level = draw_goals(self.predictor, self.curriculum, start, goal, self._rng)
+        self._shown[rows], self._original[rows], self._level[rows] = shown, goal, level
+
+    def _ask(self, method: str, *args: Any) -> np.ndarray:
+        """Return what the first copy's method says of each row of ``args``."""
+        answer = np.asarray(self.venv.env_method(method, *args, indices=[0])[0])
+        if answer.size != len(args[0]):
+            raise ValueError(
+                f"The environment's {method} must accept batches: for {len(args[0])} goals it "
+                f"returned the shape {answer.shape}."
+            )
+        return answer.reshape(-1)
+
+    def _relabel(self, obs: Observation) -> Observation:
+        return {**obs, "desired_goal": self._shown.copy()}
+
+    def _facts(self) -> list[dict[str, Any]]:
+        """What the infos of each copy say of its episode."""
+        return [
+            {"original_goal": goal, "imagined_level": level}
+            for goal, level in zip(self._original.copy(), self._level.tolist(), strict=True)
+        ]
+
+
+def imagination_of(env: VecEnv | None, asker: str) -> tuple[GoalPredictor, Curriculum]:
+    """Return the predictor and the curriculum that an environment's goals come from.
+
+    Raises:
+        ValueError: the environment imagines no goals; the message begins with ``asker``.
+    """
+    if env is None or not env.has_attr("curriculum"):
+        raise ValueError(
+            f"{asker} needs an environment wrapped in ImaginedGoalVecEnv or ImaginedGoalWrapper; "
+            "this one imagines no goals"
+        )
+    predictor = env.get_attr("predictor", indices=[0])[0]
+    return predictor, env.get_attr("curriculum", indices=[0])[0]

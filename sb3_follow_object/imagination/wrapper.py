@@ -1,0 +1,153 @@
+"""The wrapper that shows each episode of one environment its goal (paper, section 4.3).
+
+The shown goal stands in every observation, in the reward and in ``is_success``; the original one
+stays in the info. So a replay buffer around a wrapper stores what the policy saw.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ..common.providers import provider
+from ..envs import IDS, physics_id
+from .curriculum import Curriculum
+from .goal_env import STREAM, Observation, check_horizons, checked_goals, success_method
+from .goal_predictor import GoalPredictor
+from .imagined_goals import draw_goals
+from .predictor_files import POSITION
+
+AUTO = "auto"  # the predictor that is kept for the environment's task, learned where it is not
+
+
+class ImaginedGoalWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
+    """Show imagined goals in one gymnasium environment (paper, Algorithm 1).
+
+    Infos carry ``original_goal`` (3,) in metres, ``imagined_level`` (0 where the original goal is
+    shown) and, after each step, ``is_success`` for the shown and ``original_success`` for the
+    original goal. When an episode ends is left to the environment: one that terminates on its goal
+    still does so on the original one.
+
+    A wrapper that is given a Curriculum imagines goals at once. One that is given settings shows
+    original goals until a CurriculumCallback takes it up at the start of training. So the same
+    YAML makes the environment that trains and those that evaluate or play.
+
+    Args:
+        env: environment with Dict goal observations, ``compute_reward`` and a success method.
+        predictor: F_phi; or the folder it was saved in; or "auto", the one that ``get_predictor``
+            keeps for this task. The last two are loaded when first needed.
+        curriculum: its k_max is read at each reset; or keyword arguments of ``Curriculum`` besides
+            the horizon.
+
+    Attributes:
+        active: whether episodes that begin show imagined goals.
+
+    Raises:
+        ValueError: the environment has no 3-D goals, rewards or success for any goal, the
+            predictor and the curriculum have different horizons, or a setting is wrong.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        predictor: GoalPredictor | str | os.PathLike[str] = AUTO,
+        curriculum: Curriculum | Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__(env)
+        self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)
+        self._compute_reward = env.get_wrapper_attr("compute_reward")
+        self._is_success = env.get_wrapper_attr(success_method(env.has_wrapper_attr))
+        self.active = isinstance(curriculum, Curriculum)
+        self.curriculum = (
+            curriculum if isinstance(curriculum, Curriculum) else _curriculum(env, curriculum)
+        )
+        self._predictor = predictor
+        if isinstance(predictor, GoalPredictor):
+            check_horizons(predictor, self.curriculum)
+        self._rng = np.random.default_rng()
+        self._shown = self._original = np.zeros(POSITION, self._dtype)
+        self._level = 0
+
+    @property
+    def predictor(self) -> GoalPredictor:
+        """F_phi, loaded (or, with "auto", learned) when it is first asked for."""
+        if not isinstance(self._predictor, GoalPredictor):
+            self._predictor = _find_predictor(self._predictor, self.env)
+            check_horizons(self._predictor, self.curriculum)
+        return self._predictor
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode and draw its goal."""
+        if seed is not None:
+            self._rng = np.random.default_rng([seed, STREAM])
+        obs, info = self.env.reset(seed=seed, options=options)
+        self._original = obs["desired_goal"].copy()
+        self._shown, self._level = self._original, 0
+        if self.active:
+            shown, level = draw_goals(
+                self.predictor,
+                self.curriculum,
+                obs["achieved_goal"][None],
+                obs["desired_goal"][None],
+                self._rng,
+            )
+            self._shown, self._level = shown[0].astype(self._dtype), int(level[0])
+        return self._relabel(obs), {**info, **self._facts()}
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Step the environment; reward and success are those of the shown goal."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        achieved = obs["achieved_goal"]
+        if self._level > 0:
+            reward = float(self._compute_reward(achieved, self._shown, info))
+        info = {
+            **info,
+            **self._facts(),
+            "is_success": bool(self._is_success(achieved, self._shown)),
+            "original_success": bool(self._is_success(achieved, self._original)),
+        }
+        return self._relabel(obs), float(reward), terminated, truncated, info
+
+    def load_curriculum(self, state: dict[str, Any]) -> None:
+        """Follow a curriculum that advances elsewhere (``Curriculum.state_dict``), from now on."""
+        self.curriculum.load_state_dict(state)
+        self.active = True
+
+    def _relabel(self, obs: Observation) -> Observation:
+        return {**obs, "desired_goal": self._shown.copy()}
+
+    def _facts(self) -> dict[str, Any]:
+        return {"original_goal": self._original.copy(), "imagined_level": self._level}
+
+
+def _find_predictor(source: str | os.PathLike[str], env: gym.Env) -> GoalPredictor:
+    """Return the F_phi that "auto" or a folder means for an environment's task."""
+    if env.spec is None:
+        raise ValueError(
+            f"predictor={str(source)!r} needs an environment made by gymnasium.make, "
+            "whose id says which task it is; give a GoalPredictor."
+        )
+    if source == AUTO:
+        found: GoalPredictor = provider("predictor", AUTO)(env.spec.id)
+        return found
+    physics = physics_id(env.spec.id) if env.spec.id in IDS else None
+    return GoalPredictor.load(source, env_id=env.spec.id, physics=physics)
+
+
+def _curriculum(env: gym.Env, settings: Mapping[str, Any] | None) -> Curriculum:
+    """Return a curriculum of the environment's horizon."""
+    if env.spec is None or env.spec.max_episode_steps is None:
+        raise ValueError(
+            "The environment does not say how long its episodes are (spec.max_episode_steps); "
+            "give a Curriculum."
+        )
+    try:
+        return Curriculum(env.spec.max_episode_steps, **(settings or {}))
+    except TypeError as error:
+        raise ValueError(f"The curriculum cannot have these settings: {error}.") from error

@@ -1,0 +1,205 @@
+"""Stage one: the object learns to move by itself (section 3.1 of the paper)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.vec_env import VecEnv
+
+from ..callbacks.rollout import run_episodes
+from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
+from ..ddpg.her_ddpg import HerDDPG
+from ..envs import IDS
+
+
+@dataclass(frozen=True)
+class ObjectPaths:
+    """Noise-free paths of the object policy.
+
+    Attributes:
+        positions: (n, T + 1, 3) o_1 .. o_{T+1} in metres.
+        goals: (n, 3) the goal of each path in metres.
+        success_rate: share of the paths that end on their goal.
+        env_steps: steps simulated for them.
+    """
+
+    positions: np.ndarray
+    goals: np.ndarray
+    success_rate: float
+    env_steps: int
+
+
+class StopWhenSolved(BaseCallback):
+    """Tests the policy without noise now and then and stops once it succeeds often enough.
+
+    Args:
+        test_env: fresh copies of the training environment.
+        n_episodes: episodes a test.
+        every_episodes: training episodes of each copy between two tests.
+        success_rate: in [0, 1]; two tests in a row must reach it, so that luck does not stop early.
+        report: called with (env_steps, success rate) after each test.
+    """
+
+    def __init__(
+        self,
+        test_env: VecEnv,
+        n_episodes: int = 64,
+        every_episodes: int = 8,
+        success_rate: float = 0.98,
+        report: Callable[[int, float], None] | None = None,
+    ):
+        super().__init__()
+        self.test_env = test_env
+        self.n_episodes = n_episodes
+        self.every_episodes = every_episodes
+        self.success_rate = success_rate
+        self.report = report
+        self.rates: list[float] = []
+        self.test_steps = 0
+        self.stopped = False
+        self._rollouts = 0
+
+    def _on_rollout_end(self) -> None:
+        self._rollouts += 1
+        if self._rollouts % self.every_episodes:
+            return
+        episodes = run_episodes(
+            lambda obs: self.model.predict(obs, deterministic=True)[0],
+            self.test_env,
+            self.n_episodes,
+        )
+        self.test_steps += episodes.env_steps
+        self.model.num_timesteps += episodes.env_steps
+        self.rates.append(episodes.success_rate)
+        self.logger.record("object/success_rate", episodes.success_rate)
+        self.logger.dump(self.model.num_timesteps)
+        if self.report is not None:
+            self.report(self.model.num_timesteps, episodes.success_rate)
+
+    @property
+    def solved(self) -> bool:
+        """Whether the last two tests reached the success rate."""
+        return len(self.rates) >= 2 and min(self.rates[-2:]) >= self.success_rate
+
+    def _on_step(self) -> bool:
+        self.stopped = self.solved
+        return not self.stopped
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the rest of the training depends on, between rollouts."""
+        model = self.model
+        assert isinstance(model, HerDDPG) and model.replay_buffer is not None
+        return {
+            "model": model.training_state(),
+            "replay_buffer": model.replay_buffer.state_dict(),
+            "env": env_state(self.training_env),
+            "test_env": env_state(self.test_env),
+            "generators": global_generators(),
+            "rates": self.rates,
+            "test_steps": self.test_steps,
+            "stopped": self.stopped,
+            "rollouts": self._rollouts,
+        }
+
+    def load_state_dict(self, state: dict[str, Any], model: HerDDPG, env: VecEnv) -> None:
+        """Continue from `state_dict` with an algorithm and an environment like those it had."""
+        assert model.replay_buffer is not None
+        model.load_training_state(state["model"])
+        model.replay_buffer.load_state_dict(state["replay_buffer"])
+        set_env_state(env, state["env"])
+        set_env_state(self.test_env, state["test_env"])
+        set_global_generators(state["generators"])
+        self.rates = list(state["rates"])
+        self.test_steps, self.stopped = state["test_steps"], state["stopped"]
+        self._rollouts = state["rollouts"]
+
+
+def train_object_policy(
+    env: VecEnv,
+    test_env: VecEnv,
+    total_timesteps: int = 400_000,
+    *,
+    success_rate: float = 0.98,
+    seed: int | None = None,
+    report: Callable[[int, float], None] | None = None,
+    callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
+    state: dict[str, Any] | None = None,
+    **algorithm_kwargs: Any,
+) -> tuple[HerDDPG, StopWhenSolved]:
+    """Learn the object policy nu by DDPG + HER and stop as soon as it solves the task.
+
+    Args:
+        env: vectorised object-only environment, e.g. of FollowObject/PnPShelfObject-v0.
+        test_env: fresh copies of it.
+        total_timesteps: env steps after which training ends unsolved; tests are counted.
+        success_rate: noise-free success that counts as solved, in two tests in a row.
+        seed: of networks, noise and replay.
+        report: called with (env_steps, success rate) after each test.
+        callback: makes another callback from the one that tests.
+        state: of `StopWhenSolved.state_dict`; training goes on exactly from there.
+        algorithm_kwargs: of HerDDPG.
+
+    Returns:
+        The algorithm and the callback that knows the test results.
+    """
+    solved = StopWhenSolved(test_env, success_rate=success_rate, report=report)
+    model = HerDDPG("MultiInputPolicy", env, seed=seed, **algorithm_kwargs)
+    if state is not None:
+        solved.load_state_dict(state, model, env)
+    if not solved.stopped:
+        model.learn(
+            total_timesteps - model.num_timesteps,
+            callback=CallbackList([solved, *([callback(solved)] if callback else [])]),
+            log_interval=None,  # type: ignore[arg-type]
+            reset_num_timesteps=state is None,
+        )
+    return model, solved
+
+
+def keeps_object_on_table(env_id: str, setting: bool | None = None) -> bool:
+    """Whether the object may not leave the table in the first stage.
+
+    Args:
+        env_id: a task of this package.
+        setting: None decides by the task: yes where the gripper is blocked (Push tasks).
+    """
+    return IDS[env_id][0].blocked_gripper if setting is None else setting
+
+
+def collect_paths(model: Any, env: VecEnv, n_episodes: int) -> ObjectPaths:
+    """Roll the object policy out without noise (section 3.2 of the paper).
+
+    Args:
+        model: anything with SB3's `predict`.
+        env: vectorised object-only environment whose episodes all have the same length.
+        n_episodes: a multiple of `env.num_envs` wastes no steps.
+    """
+    current: list[np.ndarray] = []
+    paths: list[np.ndarray] = []
+    goals: list[np.ndarray] = []
+
+    def keep(obs: Any, actions: Any, rewards: Any, dones: Any, infos: Any, next_obs: Any) -> None:
+        if not current:
+            current.append(obs["achieved_goal"].copy())
+        current.append(next_obs["achieved_goal"].copy())
+        if dones.all():
+            good = ["diverged" not in info for info in infos]
+            paths.append(np.stack(current, axis=1)[good])
+            goals.append(obs["desired_goal"][good])
+            current.clear()
+        elif dones.any():
+            raise ValueError("the object's episodes differ in length; F_phi needs a fixed horizon")
+
+    episodes = run_episodes(
+        lambda obs: model.predict(obs, deterministic=True)[0],
+        env,
+        -(-n_episodes // env.num_envs) * env.num_envs,
+        keep,
+    )
+    return ObjectPaths(
+        np.concatenate(paths), np.concatenate(goals), episodes.success_rate, episodes.env_steps
+    )

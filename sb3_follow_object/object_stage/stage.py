@@ -1,0 +1,183 @@
+"""Stages one and two: the object alone learns the way, and F_phi learns to imagine it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from ..common.reports import Report
+from ..common.seeds import stream_seed
+from ..ddpg.her_ddpg import HerDDPG
+from ..envs import make_vec, object_id, physics_id
+from ..imagination.goal_predictor import GoalPredictor
+from .networks import ObjectNetworks
+from .policy import (
+    StopWhenSolved,
+    collect_paths,
+    keeps_object_on_table,
+    train_object_policy,
+)
+
+
+class ObjectStage:
+    """What a task's object learns alone (paper, sections 4.1 and 4.2).
+
+    Args:
+        settings: `FollowObject`'s; env_id, seed, object_*, *_fit, n_paths and n_threads are read.
+        report: called with a sentence as it goes on.
+        needs_networks: whether SLDR's reward will read the object's networks.
+
+    Attributes:
+        predictor: F_phi, once it is learned or given.
+        networks: what SLDR's reward reads, once that is.
+        steps: env steps that both stages cost.
+        policy_steps: those of the object policy alone, where it was learned here.
+        success: share of the object's last noise-free episodes that ended on their goal.
+    """
+
+    def __init__(
+        self,
+        settings: Mapping[str, Any],
+        report: Report,
+        needs_networks: bool,
+    ):
+        self.settings = settings
+        self.env_id: str = settings["env_id"]
+        self.seed: int = settings["seed"]
+        self.report = report
+        self.needs_networks = needs_networks
+        self.predictor: GoalPredictor | None = None
+        self.networks: ObjectNetworks | None = None
+        self.steps = self.policy_steps = 0
+        self.success = float("nan")
+
+    def use_predictor(self, predictor: GoalPredictor) -> None:
+        """Take an F_phi that was made before.
+
+        Raises:
+            ValueError: it was made for another task, for other physics, or from an object that
+                was kept on the table where this one's is not, or the other way round.
+        """
+        if predictor.env_id != self.env_id or predictor.physics != physics_id(self.env_id):
+            raise ValueError(
+                f"the predictor was made for {predictor.env_id} (physics {predictor.physics}), "
+                f"not for {self.env_id} (physics {physics_id(self.env_id)}); make a new one"
+            )
+        on_table = self._on_table()
+        if predictor.object_on_table not in (None, on_table):
+            raise ValueError(
+                f"the predictor was made with object_on_table={predictor.object_on_table}, "
+                f"not {on_table}; make a new one"
+            )
+        self.predictor = predictor
+
+    def use_networks(self, networks: ObjectNetworks) -> None:
+        """Take networks that were made before.
+
+        Raises:
+            ValueError: they were made for another task or for other physics.
+        """
+        networks.check(self.env_id, physics_id(self.env_id), "the object_networks given")
+        self.networks = networks
+
+    def learn_policy(
+        self,
+        callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
+        state: dict[str, Any] | None = None,
+        between_epochs: Callable[[], None] = lambda: None,
+        networks: bool = False,
+    ) -> tuple[HerDDPG, StopWhenSolved]:
+        """Run stage one (section 4.1): the object policy, and with SLDR the networks that it needs.
+
+        Args:
+            callback: makes a callback from the one that tests the object's policy.
+            state: of that one; stage one goes on exactly from there.
+            between_epochs: called while the inverse model is fitted; may raise to stop.
+            networks: whether to make what SLDR needs for others, though this run does not.
+        """
+        settings = self.settings
+        self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
+        env, test_env = (self._env(name) for name in ("object", "object_test"))
+        model, solved = train_object_policy(
+            env,
+            test_env,
+            settings["object_timesteps"],
+            seed=stream_seed(self.seed, "object"),
+            report=lambda steps, rate: self.report(f"  {steps:>7} steps: success {rate:.2f}"),
+            callback=callback,
+            state=state,
+            **settings["object_algorithm"],
+        )
+        self.steps = self.policy_steps = model.num_timesteps
+        if networks or self.needs_networks:
+            self.networks = ObjectNetworks.learned(
+                model,
+                self.env_id,
+                physics_id(self.env_id),
+                seed=stream_seed(self.seed, "inverse"),
+                between_updates=between_epochs,
+                **settings["inverse_fit"],
+            )
+            error = self.networks.inverse_error
+            self.report(f"  {self.steps} env steps, inverse model's error {error:.3f}")
+        env.close()
+        test_env.close()
+        self.success = solved.rates[-1] if solved.rates else float("nan")
+        return model, solved
+
+    def learn_predictor(
+        self,
+        callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
+        state: dict[str, Any] | None = None,
+        between_epochs: Callable[[], None] = lambda: None,
+        networks: bool = False,
+    ) -> GoalPredictor:
+        """Run both stages: object policy, then F_phi (sections 4.1 and 4.2).
+
+        Args:
+            callback: as in `learn_policy`.
+            state: as in `learn_policy`.
+            between_epochs: called while F_phi and the inverse model are fitted; may raise to stop.
+            networks: as in `learn_policy`.
+        """
+        settings = self.settings
+        model, solved = self.learn_policy(callback, state, between_epochs, networks)
+        env = self._env("paths")
+        paths = collect_paths(model, env, settings["n_paths"])
+        env.close()
+        self.steps += paths.env_steps
+        self.success = paths.success_rate
+        self.report(
+            f"  {self.steps} env steps, noise-free success {paths.success_rate:.2f}"
+            + ("" if solved.solved else " (not solved: its imagined goals may mislead)")
+        )
+        self.report("stage 2: F_phi learns to imagine goals")
+        self.predictor = GoalPredictor.fit(
+            paths.positions,
+            paths.goals,
+            env_id=self.env_id,
+            physics=physics_id(self.env_id),
+            object_on_table=self._on_table(),
+            seed=stream_seed(self.seed, "predictor"),
+            progress=lambda epoch, loss: between_epochs(),
+            **{"device": str(model.device), **settings["predictor_fit"]},
+        )
+        self.report(f"  held-out error {float(np.mean(self.predictor.error_mm)):.1f} mm")
+        return self.predictor
+
+    def _on_table(self) -> bool:
+        return keeps_object_on_table(self.env_id, self.settings["object_on_table"])
+
+    def _env(self, purpose: str) -> VecEnv:
+        env = make_vec(
+            object_id(self.env_id),
+            self.settings["object_n_envs"],
+            self.settings["n_threads"],
+            on_table=self._on_table(),
+        )
+        env.seed(stream_seed(self.seed, purpose))
+        return env

@@ -1,0 +1,426 @@
+"""A hindsight replay buffer whose sampling does not slow down as it fills."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from ..imagination.imagined_goals import imagine
+from ..imagination.vec_env import imagination_of
+from ..settings.keywords import check_keywords
+from .cher import GoalSelection
+from .episode_table import EpisodeTable
+from .record_buffer import NEXT_DESIRED, RecordReplayBuffer, check_finite
+
+RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
+GRAVITY = 9.81  # m/s^2
+IMAGINED_RATIO = "imagined_ratio > 0"  # what needs an environment that imagines goals
+
+
+class FollowObjectReplayBuffer(RecordReplayBuffer):
+    """SB3's HerReplayBuffer with imagined goals, moved-object sampling and float32 storage.
+
+    Takes the place of `HerReplayBuffer` in any off-policy algorithm of SB3.
+    The distribution of the samples is that of HerReplayBuffer when `imagined_ratio` and
+    `moved_ratio` are 0; a virtual transition is then chosen per transition with probability
+    n_sampled_goal / (n_sampled_goal + 1) rather than in an exact share.
+
+    Args:
+        imagined_ratio: share in [0, 1] of the virtual transitions relabelled with a goal that
+            F_phi imagines from the episode's start and original goal, at a level of the current
+            curriculum, instead of with an achieved goal. 0 is the paper's setting. Above 0, the
+            environment must be wrapped in `ImaginedGoalVecEnv` or `ImaginedGoalWrapper`.
+        moved_ratio: share in [0, 1] of each batch drawn only from episodes in which the achieved
+            goal moved by more than `moved_distance`; the rest is drawn from all. 0 is the paper's.
+        moved_distance: metres.
+        moved_priority: how that share is drawn: "uniform", or "energy", in proportion to the
+            energy that the object was given in the episode (Zhao and Tresp, Energy-Based Hindsight
+            Experience Prioritization), so that lifting counts for more than pushing. The third
+            coordinate of a goal is then its height.
+        step_seconds: duration of an environment step, for the object's speed.
+        min_goal_distance: metres; a hindsight goal nearer than this to where the episode's achieved
+            goal began was reached before anything was done. Such a transition keeps the goal that
+            was shown, so that episodes that moved nothing do not teach to stay. 0 is the paper's.
+        cher: keyword arguments of `GoalSelection`, which then chooses each batch from more
+            candidates; None chooses nothing.
+        reward_function: called as f(achieved (n, d), desired (n, d), infos) -> (n,); by default the
+            `compute_reward` of the first environment is asked, which costs a round trip between
+            processes in a SubprocVecEnv.
+        seed: of the buffer's own generator; by default drawn from NumPy's global one, which SB3
+            seeds.
+
+    The other arguments are HerReplayBuffer's.
+
+    Raises:
+        ValueError: if a ratio is outside [0, 1], or imagined goals are asked for without the
+            wrapper that imagines them.
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space,
+        env: VecEnv,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        n_sampled_goal: int = 4,
+        goal_selection_strategy: GoalSelectionStrategy | str = "future",
+        copy_info_dict: bool = False,
+        imagined_ratio: float = 0.0,
+        moved_ratio: float = 0.0,
+        moved_distance: float = 0.01,
+        moved_priority: str = "uniform",
+        step_seconds: float = 0.04,
+        min_goal_distance: float = 0.0,
+        cher: dict[str, Any] | None = None,
+        reward_function: RewardFunction | None = None,
+        seed: int | None = None,
+    ):
+        if moved_priority not in ("uniform", "energy"):
+            raise ValueError(f"moved_priority is {moved_priority!r}; 'uniform' and 'energy' exist")
+        if step_seconds <= 0.0:
+            raise ValueError(f"step_seconds is {step_seconds}; it must be > 0")
+        if moved_distance < 0.0 or min_goal_distance < 0.0:
+            raise ValueError(
+                f"moved_distance ({moved_distance}) and min_goal_distance ({min_goal_distance}) "
+                "must be >= 0 metres"
+            )
+        for name, ratio in (("imagined_ratio", imagined_ratio), ("moved_ratio", moved_ratio)):
+            if not 0.0 <= ratio <= 1.0:
+                raise ValueError(f"{name} is {ratio}; it must lie in [0, 1]")
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            env,
+            device=device,
+            n_envs=n_envs,
+            optimize_memory_usage=optimize_memory_usage,
+            handle_timeout_termination=handle_timeout_termination,
+            n_sampled_goal=n_sampled_goal,
+            goal_selection_strategy=goal_selection_strategy,
+            copy_info_dict=copy_info_dict,
+        )
+        self.imagined_ratio = imagined_ratio
+        self.moved_ratio = moved_ratio
+        self.moved_distance = moved_distance
+        self.moved_priority = moved_priority
+        self.step_seconds = step_seconds
+        self.min_goal_distance = min_goal_distance
+        if cher is not None:
+            check_keywords("cher", cher, GoalSelection.__init__)
+        self.selection = None if cher is None else GoalSelection(**cher)
+        self.reward_function = reward_function
+        goal_shape = self.observations["desired_goal"].shape
+        if moved_priority == "energy" and goal_shape[-1] < 3:
+            raise ValueError(
+                f"moved_priority 'energy' reads a height in metres from goals of 3 numbers; these "
+                f"have {goal_shape[-1]}: take 'uniform'"
+            )
+        if imagined_ratio > 0.0:
+            imagination_of(env, IMAGINED_RATIO)  # raises now rather than at the first sample
+        self.rng = np.random.default_rng(np.random.randint(2**31) if seed is None else seed)
+
+        self.original_goals = np.zeros(
+            goal_shape if imagined_ratio > 0.0 else (0,), dtype=np.float32
+        )
+        if not copy_info_dict:
+            self.infos = np.empty((0, n_envs), dtype=object)  # one unused dict a slot otherwise
+        # Whether what a slot achieved is far enough from where its episode began.
+        self._far = np.zeros(self.dones.shape if min_goal_distance > 0.0 else (0,), dtype=bool)
+        self.table = EpisodeTable()
+        self.n_added = 0  # time-steps so far
+        self.revision = 0  # counts contents that were loaded over the earlier ones
+
+    def add(  # type: ignore[override]
+        self,
+        obs: dict[str, np.ndarray],
+        next_obs: dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one step of every environment; arguments as in HerReplayBuffer.
+
+        An episode whose info says "diverged" at its end is dropped: it is never sampled.
+
+        Raises:
+            ValueError: an environment returned NaN or infinity; nothing of the step is stored.
+        """
+        check_finite(obs, next_obs, action, reward)
+        pos = self.pos
+        rows = [
+            self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
+            for env_idx in np.flatnonzero(self.ep_length[pos])
+        ]
+        for row in sorted(rows):
+            self._forget_episode(row)
+        self._make_room_for(obs, next_obs)
+        self.ep_start[pos] = self._current_ep_start
+        if self.copy_info_dict:
+            self.infos[pos] = infos
+        if self.imagined_ratio > 0.0:
+            self.original_goals[pos] = [info["original_goal"] for info in infos]
+        super(HerReplayBuffer, self).add(obs, next_obs, action, reward, done, infos)
+        self.n_added += 1
+        for env_idx in np.flatnonzero(done):
+            if "diverged" in infos[env_idx]:
+                self._current_ep_start[env_idx] = self.pos
+            else:
+                self._compute_episode_length(int(env_idx))
+
+    def _forget_episode(self, row: int) -> None:
+        """Make an episode that is about to be overwritten invisible to sampling."""
+        env_idx = self.table.env[row]
+        slots = (self.table.start[row] + np.arange(self.table.length[row])) % self.buffer_size
+        self.ep_length[slots, env_idx] = 0
+        self.table.remove(row)
+
+    def _compute_episode_length(self, env_idx: int) -> None:
+        start = int(self._current_ep_start[env_idx])
+        super()._compute_episode_length(env_idx)
+        # An episode as long as the whole buffer starts and ends on the same slot.
+        length = (self.pos - start) % self.buffer_size or self.buffer_size
+        slots = (start + np.arange(length)) % self.buffer_size
+        self.ep_length[slots, env_idx] = length
+        origin = self.observations["achieved_goal"][start, env_idx]
+        path = self.next_observations["achieved_goal"][slots, env_idx]
+        if self.min_goal_distance > 0.0:
+            distance = np.linalg.norm(path - origin, axis=1)
+            self._far[slots, env_idx] = distance >= self.min_goal_distance
+        self.table.insert(start, env_idx, length, self._priority(origin, path))
+
+    def _priority(self, origin: np.ndarray, path: np.ndarray) -> float:
+        """Priority of an episode from where the achieved goal began (d,) and went (length, d)."""
+        if np.linalg.norm(path - origin, axis=-1).max() <= self.moved_distance:
+            return 0.0
+        if self.moved_priority == "uniform":
+            return 1.0
+        moves = np.diff(path, axis=0, prepend=origin[None])
+        speed = np.linalg.norm(moves, axis=-1) / self.step_seconds
+        energy = GRAVITY * path[:, 2] + 0.5 * speed**2  # a unit mass's
+        gains = np.diff(energy, prepend=GRAVITY * origin[2])
+        return float(np.clip(gains, 0.0, None).sum())
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the content and the generator, as views that later additions change.
+
+        Raises:
+            ValueError: with `copy_info_dict`; infos are Python objects.
+        """
+        if self.copy_info_dict:
+            raise ValueError("a replay buffer's state has no infos: leave copy_info_dict out")
+        used = self.buffer_size if self.full else self.pos
+        return {
+            "pos": self.pos,
+            "full": self.full,
+            "current_episode_start": self._current_ep_start,
+            "slots": {name: store[:used] for name, store in self._stores().items()},
+            "table": self.table.state_dict(),
+            "rng": self.rng.bit_generator.state,
+            "selection": None if self.selection is None else self.selection.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict` of a buffer of the same shape.
+
+        Raises:
+            ValueError: the state belongs to a buffer with other stores or shapes.
+        """
+        slots = state["slots"]
+        self._share_goals(NEXT_DESIRED not in slots)
+        stores = self._stores()
+        if set(stores) != set(slots) or any(
+            len(slots[name]) > len(store) or slots[name].shape[1:] != store.shape[1:]
+            for name, store in stores.items()
+        ):
+            raise ValueError("the saved replay buffer has another shape than this one")
+        for name, store in stores.items():
+            store[: len(slots[name])] = slots[name]
+        self.pos, self.full = state["pos"], state["full"]
+        self.revision += 1
+        self._current_ep_start = state["current_episode_start"].copy()
+        self.table.load_state_dict(state["table"])
+        self.rng.bit_generator.state = state["rng"]
+        if self.selection is not None:
+            self.selection.load_state_dict(state["selection"])
+
+    def _stores(self) -> dict[str, np.ndarray]:
+        stores = super()._stores()
+        if self.imagined_ratio > 0.0:
+            stores["original_goals"] = self.original_goals
+        if self.min_goal_distance > 0.0:
+            stores["far"] = self._far
+        return stores
+
+    def check_ready(self) -> None:
+        """Raise RuntimeError while there is nothing to draw from."""
+        if self.table.n_transitions() == 0:
+            raise RuntimeError(
+                "the replay buffer holds no finished episode yet; "
+                "set learning_starts to at least one episode of every environment"
+            )
+
+    def moved_share(self) -> float:
+        """Share of the stored transitions that belong to episodes in which the object moved."""
+        total = self.table.n_transitions()
+        return self.table.n_transitions(with_priority=True) / total if total else 0.0
+
+    def selection_log(self) -> dict[str, float]:
+        """Return what there is to log about how batches are chosen."""
+        if self.selection is None:
+            return {}
+        return {"cher/proximity_weight": float(self.selection.proximity_weights(1)[0])}
+
+    def sample(  # type: ignore[override]
+        self, batch_size: int, env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        """Draw transitions and relabel them in one vectorised pass.
+
+        Args:
+            batch_size: number of transitions.
+            env: to normalise observations and rewards, as in SB3.
+
+        Raises:
+            RuntimeError: before the end of the first episode.
+        """
+        return self.sample_with_steps(batch_size, env)[0]
+
+    def sample_with_steps(
+        self, batch_size: int, env: VecNormalize | None = None, n_batches: int = 1
+    ) -> tuple[DictReplayBufferSamples, th.Tensor]:
+        """Draw as `sample` does, and say how soon the episode itself reached each goal.
+
+        Args:
+            batch_size: number of transitions in all.
+            env: as in `sample`.
+            n_batches: gradient steps that they are for: batch_size / n_batches each, in this order.
+
+        Returns:
+            The transitions, and (batch_size, 1) float: -1s that the episode was paid from the
+            transition until it stood on the hindsight goal; infinite where the goal shown is kept.
+        """
+        self.check_ready()
+        if self.selection is not None:
+            batch_size *= self.selection.candidates
+        row, step = self._draw(batch_size)
+        episode = self.table.facts.take(row, axis=0)
+        flat = self._flat(episode, step)
+        achieved = self._achieved_goals(flat)
+        steps_to_goal = np.full(batch_size, np.inf, dtype=np.float32)
+        virtual = np.flatnonzero(self.rng.random(batch_size) < self.her_ratio)
+        relabelled = episode.take(virtual, axis=0)
+        goals, steps, far = self._hindsight_goals(relabelled, step.take(virtual))
+        if far is not None:
+            kept = np.flatnonzero(far)
+            virtual, steps = virtual.take(kept), steps.take(kept)
+            goals = goals.take(kept, axis=0)
+        goals = self._goals_in(goals)
+        if self.imagined_ratio > 0.0:
+            chosen = np.flatnonzero(self.rng.random(len(virtual)) < self.imagined_ratio)
+            goals[chosen] = self._imagined_goals(episode[virtual[chosen]])
+            steps[chosen] = np.inf
+        steps_to_goal[virtual] = steps
+        reached = self._goals_in(achieved.take(virtual, axis=0))
+        rewards = self._reward(reached, goals, flat.take(virtual))
+        # Last, as it drives all else out of the cache.
+        batch = self._gather(flat, achieved)
+        batch.rewards[virtual] = rewards
+        for desired in batch.desired_goals():
+            for i in range(goals.shape[1]):  # half the time of all at once, for a few coordinates
+                desired[virtual, i] = goals[:, i]
+
+        if self.selection is not None:
+            chosen = self.selection.choose(
+                batch.observations["desired_goal"],
+                batch.observations["achieved_goal"],
+                n_batches,
+                self.rng,
+            )
+            batch, steps_to_goal = batch.pick(chosen), steps_to_goal[chosen]
+        obs, next_obs = (
+            self._normalize_obs(observations, env)
+            for observations in (batch.observations, batch.next_observations)
+        )
+        assert isinstance(obs, dict) and isinstance(next_obs, dict)
+        rewards = self._normalize_reward(batch.rewards, env)
+        samples = DictReplayBufferSamples(
+            observations={key: self._to_tensor(value) for key, value in obs.items()},
+            actions=self._to_tensor(batch.actions),
+            next_observations={key: self._to_tensor(value) for key, value in next_obs.items()},
+            dones=self._to_tensor(batch.dones).reshape(-1, 1),
+            rewards=self._to_tensor(rewards).reshape(-1, 1),
+        )
+        return samples, self._to_tensor(steps_to_goal).reshape(-1, 1)
+
+    def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        row, step = self.table.draw(n, self.rng)
+        if self.moved_ratio > 0.0 and self.table.n_transitions(with_priority=True):
+            chosen = np.flatnonzero(self.rng.random(n) < self.moved_ratio)
+            row[chosen], step[chosen] = self.table.draw(len(chosen), self.rng, by_priority=True)
+        return row, step
+
+    def _flat(self, episode: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Indices slot * n_envs + environment (n,) of steps of episodes, facts (n, 4)."""
+        slot = episode[:, 0] + step
+        slot -= self.buffer_size * (slot >= self.buffer_size)
+        return slot * self.n_envs + episode[:, 1]
+
+    def _to_tensor(self, array: np.ndarray) -> th.Tensor:
+        return th.from_numpy(np.asarray(array, dtype=np.float32)).to(self.device)
+
+    def _hindsight_goals(
+        self, episode: np.ndarray, step: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Achieved goals of the same episode, by the strategy, not yet cut to (n, d).
+
+        Second, the steps from the transition to the one that achieved the goal (n,), float;
+        infinite for goals of the past. Third, if that matters, whether the goal lies far enough
+        from where the episode began (n,).
+        """
+        length = episode[:, 2]
+        if self.goal_selection_strategy == GoalSelectionStrategy.FINAL:
+            chosen = length - 1
+        elif self.goal_selection_strategy == GoalSelectionStrategy.FUTURE:
+            chosen = self.rng.integers(step, length)
+        else:
+            chosen = self.rng.integers(0, length)
+        flat = self._flat(episode, chosen)
+        steps = (chosen - step).astype(np.float32)
+        if self.goal_selection_strategy == GoalSelectionStrategy.EPISODE:
+            steps[steps < 0] = np.inf
+        far = self._take(self._far, flat) if self.min_goal_distance > 0.0 else None
+        return self._achieved_goals(flat), steps, far
+
+    def _imagined_goals(self, episode: np.ndarray) -> np.ndarray:
+        """F_phi(o_1, g, k) of each episode at a level drawn from 1..k_max (n, d)."""
+        predictor, curriculum = imagination_of(self.env, IMAGINED_RATIO)
+        first = episode[:, 0], episode[:, 1]
+        start = self.observations["achieved_goal"][first]
+        goal = self.original_goals[first]
+        level = self.rng.integers(1, curriculum.k_max, size=len(episode), endpoint=True)
+        return imagine(predictor, curriculum, start, goal, level)
+
+    def _reward(self, achieved: np.ndarray, desired: np.ndarray, flat: np.ndarray) -> np.ndarray:
+        """Rewards (n,) of goals achieved for goals desired (n, d) in the transitions `flat`."""
+        if not len(flat):
+            return np.zeros(0, dtype=np.float32)
+        # Where no infos are kept, one empty dict does for all.
+        infos = list(self._take(self.infos, flat)) if self.copy_info_dict else [{}] * len(flat)
+        if self.reward_function is not None:
+            return self.reward_function(achieved, desired, infos)
+        if self.env is None:
+            raise RuntimeError("the replay buffer has no environment: call set_env() after loading")
+        return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]

@@ -1,0 +1,1 @@
+"""Training in a folder: started, interrupted, resumed, evaluated; the predictors that are kept."""

@@ -1,0 +1,99 @@
+"""F_phi for whoever needs one: the first two stages alone, and a cache of their results."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from ..common.files import lock
+from ..common.reports import Report
+from ..envs import physics_id
+from ..follow_object.follow_object import FollowObject
+from ..imagination.goal_predictor import GoalPredictor
+from ..imagination.predictor_files import FACTS_FILE
+from ..object_stage.networks import FILE as OBJECT_FILE
+from ..object_stage.networks import ObjectNetworks
+from ..object_stage.policy import keeps_object_on_table
+from ..settings.presets import run_config
+from ..settings.run_config import RunConfig
+
+_FILES = (FACTS_FILE, OBJECT_FILE)
+CACHE_VARIABLE = "SB3_FOLLOW_OBJECT_CACHE"
+
+
+def get_predictor(
+    env_id: str, folder: str | os.PathLike[str] | None = None, report: Report = print
+) -> GoalPredictor:
+    """Return a task's F_phi, learned with the default settings the first time it is asked for.
+
+    Args:
+        env_id: a task of this package.
+        folder: where the predictor is kept; by default a folder for this task and its physics in
+            $SB3_FOLLOW_OBJECT_CACHE or in the user's cache.
+        report: called with a sentence now and then while it is learned, which takes minutes.
+
+    Raises:
+        ValueError: the folder holds a predictor for another task, other physics or another
+            object_on_table, a damaged one, or an object's networks alone; or the id is not of this
+            package.
+    """
+    path = _kept(FACTS_FILE, env_id, folder, report)
+    on_table = keeps_object_on_table(env_id)
+    physics = physics_id(env_id)
+    return GoalPredictor.load(path.parent, env_id=env_id, physics=physics, object_on_table=on_table)
+
+
+def get_object_networks(
+    env_id: str, folder: str | os.PathLike[str] | None = None, report: Report = print
+) -> ObjectNetworks:
+    """Return what SLDR needs of a task's object stage; kept beside F_phi, see `get_predictor`.
+
+    Raises:
+        ValueError: as `get_predictor`; or the folder holds F_phi alone, which is not replaced.
+    """
+    path = _kept(OBJECT_FILE, env_id, folder, report)
+    return ObjectNetworks.load(path, env_id=env_id, physics=physics_id(env_id))
+
+
+def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report: Report) -> Path:
+    """Return a file of a task's first two stages, which run unless it is there already."""
+    path = cache_folder() / env_id / physics_id(env_id) if folder is None else Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    with lock(path, wait=True):  # those of a SubprocVecEnv come together
+        if not (path / name).exists():
+            other = next((file for file in _FILES if (path / file).exists()), None)
+            if folder is not None and other is not None:
+                raise ValueError(f"{path} has {other} but no {name}; give an empty folder")
+            learn_predictor(run_config(env_id), path, report)
+    return path / name
+
+
+def learn_predictor(
+    config: RunConfig, folder: str | os.PathLike[str], report: Report = print
+) -> GoalPredictor:
+    """Run stages one and two (paper, sections 4.1 and 4.2) and save what they learn in a folder."""
+    run = FollowObject(
+        config.env_id, seed=config.seed, report=report, **{**config.settings, "n_envs": 1}
+    )
+    try:
+        predictor = run.object_stage.learn_predictor(networks=True)
+    finally:
+        run.close()
+    assert run.object_stage.networks is not None
+    predictor.save(folder)
+    run.object_stage.networks.save(Path(folder) / OBJECT_FILE)
+    return predictor
+
+
+def cache_folder() -> Path:
+    """Return the folder that predictors are kept in; it need not exist."""
+    if CACHE_VARIABLE in os.environ:
+        return Path(os.environ[CACHE_VARIABLE])
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home()))
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "sb3_follow_object"

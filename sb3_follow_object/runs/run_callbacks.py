@@ -1,0 +1,160 @@
+"""What a run in a folder does between rollouts: checkpoints, the best policy, stopping."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from ..callbacks.eval_callback import OriginalGoalEvalCallback
+from ..follow_object.follow_object import FollowObject
+from .checkpoints import Checkpoints
+from .run_folder import BEST_POLICY, POLICY
+
+Progress = Callable[[dict[str, Any]], None]
+
+
+class StopSignals:
+    """Notes SIGINT and SIGTERM, so that a training can end where nothing is lost.
+
+    A second signal raises KeyboardInterrupt at once.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._earlier: dict[int, Any] = {}
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a signal has come."""
+        if self.requested:
+            raise KeyboardInterrupt
+
+    def __enter__(self) -> StopSignals:
+        for sig in (signal.SIGINT, signal.SIGTERM):
+            self._earlier[sig] = signal.signal(sig, self._note)
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        for sig, handler in self._earlier.items():
+            signal.signal(sig, handler)
+
+    def _note(self, signum: int, frame: Any) -> None:
+        self.check()
+        self.requested = True
+
+
+class CheckpointCallback(BaseCallback):
+    """Writes a checkpoint between rollouts when it is time or a signal has come, and at the end.
+
+    Args:
+        checkpoints: writes them.
+        state: returns what resuming needs.
+        env_steps: returns the run's steps so far.
+        minutes: wall time between checkpoints.
+        stop: what a signal asks for.
+    """
+
+    def __init__(
+        self,
+        checkpoints: Checkpoints,
+        state: Callable[[], dict[str, Any]],
+        env_steps: Callable[[], int],
+        minutes: float,
+        stop: StopSignals,
+    ):
+        super().__init__()
+        self.checkpoints = checkpoints
+        self.state = state
+        self.env_steps = env_steps
+        self.minutes = minutes
+        self.stop = stop
+        self._last = time.monotonic()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self.checkpoints.poll()
+        if self.stop.requested or time.monotonic() - self._last > 60.0 * self.minutes:
+            self._write()
+        self.stop.check()
+
+    def _on_training_end(self) -> None:
+        self._write()
+
+    def _write(self) -> None:
+        self.checkpoints.write(self.env_steps(), self.state())
+        self._last = time.monotonic()
+
+
+class RunCallback(BaseCallback):
+    """Saves the policy at each validation, and the best one apart, and reports progress.
+
+    Args:
+        run: what is trained.
+        evaluation: its validation callback, which runs before this one.
+        folder: of the run.
+        progress: called with the current figures after each rollout.
+    """
+
+    def __init__(
+        self,
+        run: FollowObject,
+        evaluation: OriginalGoalEvalCallback,
+        folder: Path,
+        progress: Progress,
+    ):
+        super().__init__()
+        self.run = run
+        self.evaluation = evaluation
+        self.folder = folder
+        self.progress = progress
+        self.best = -1.0
+        self._n_validated = 0
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        assert self.run.model is not None
+        if not all(bool(th.isfinite(w).all()) for w in self.run.model.actor.parameters()):
+            raise RuntimeError("diverged: the policy is not finite")
+        n_validated = self.evaluation.n_evaluations
+        if n_validated > self._n_validated:
+            self._n_validated = n_validated
+            rate = self.evaluation.success_rate
+            assert rate is not None
+            self.run.save_policy(self.folder / POLICY)
+            if rate >= self.best:
+                self.best = rate
+                self.run.save_policy(self.folder / BEST_POLICY)
+            self.logger.dump(self.run.env_steps)
+        self.progress(
+            {
+                "env_steps": self.run.env_steps,
+                "k_max": self.run.curriculum.k_max if self.run.imagine else None,
+                "success_rate": self.evaluation.success_rate,
+            }
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that resuming the third stage needs."""
+        return {
+            "stage": "robot",
+            "run": self.run.state_dict(),
+            "evaluation": self.evaluation.state_dict(),
+            "best": self.best,
+            "n_validated": self._n_validated,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self.run.load_state_dict(state["run"])
+        self.evaluation.load_state_dict(state["evaluation"])
+        self.best = state["best"]
+        self._n_validated = state["n_validated"]

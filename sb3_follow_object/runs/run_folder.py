@@ -1,0 +1,167 @@
+"""A run's folder: what is in it, and whose it is."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from ..common.files import LOCK, atomic_write
+from ..settings.run_config import RunConfig
+from .checkpoints import checkpoint_files
+
+CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
+POLICY, BEST_POLICY = "policy.safetensors", "best_policy.safetensors"
+VERSIONS = "versions.json"
+CROSS_TESTS = "cross_tests.json"  # the policy on other tasks
+COMMAND = "command.txt"  # what started the run, and what gave it other steps later
+PACKAGES = ["sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics"]
+PACKAGES += ["mujoco", "torch", "numpy"]
+
+# What everything that reads a result needs of it.
+_RESULT: dict[str, type] = {"env_steps": int, "wall_s": float, "success_rate": float}
+
+
+def check_empty(folder: Path) -> None:
+    """Raise a ValueError unless a run can start in the folder."""
+    if folder.exists() and not (folder.is_dir() and all(map(_is_of_a_start, folder.iterdir()))):
+        raise ValueError(f"{folder} is not empty; resume the run in it or give another folder")
+
+
+def _is_of_a_start(path: Path) -> bool:
+    """Whether a file is what a start leaves that did not come to the configuration."""
+    half_written = path.name.startswith(".") and path.suffix == ".tmp"
+    return half_written or path.name in (LOCK, VERSIONS, COMMAND)
+
+
+def check_same_run(folder: Path, config: RunConfig) -> None:
+    """Raise a ValueError unless the folder holds the run of the configuration, steps apart."""
+    path = folder / CONFIG
+    if not path.exists():
+        raise ValueError(f"{folder} holds no run to resume")
+    try:
+        kept = RunConfig(**json.loads(path.read_text()))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not the configuration of a run ({error})") from error
+    same_steps = replace(kept, total_timesteps=config.total_timesteps)
+    different = difference(asdict(same_steps), asdict(config))
+    if different is not None:
+        name, ours, theirs = different
+        raise ValueError(
+            f"the run in {folder} has {name} {ours!r}, not {theirs!r}; "
+            "resume it as it is or start another in another folder"
+        )
+
+
+def difference(kept: dict[str, Any], wanted: dict[str, Any]) -> tuple[str, Any, Any] | None:
+    """Return the first setting that differs, by its dotted name, and its two values."""
+    ours, theirs = (_flat(json.loads(json.dumps(settings))) for settings in (kept, wanted))
+    for name in {**ours, **theirs}:
+        if ours.get(name) != theirs.get(name):
+            return name, ours.get(name), theirs.get(name)
+    return None
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings by their dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        nested = _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else None
+        flat |= {f"{prefix}{name}": value} if nested is None else nested
+    return flat
+
+
+def claim(folder: Path, config: RunConfig, command: str = "") -> None:
+    """Create a run's folder with its config and versions: what `train(resume=True)` asks for."""
+    folder.mkdir(parents=True, exist_ok=True)
+    check_empty(folder)  # again, now that no other process can come in between
+    versions: dict[str, str | None] = {n: importlib.metadata.version(n) for n in PACKAGES}
+    versions |= {"python": platform.python_version(), "commit": source_commit()}
+    atomic_write(folder / VERSIONS, json.dumps(versions, indent=2).encode())
+    if command:
+        atomic_write(folder / COMMAND, f"{command}\n".encode())
+    atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
+
+
+def take_steps(folder: Path, config: RunConfig, command: str = "") -> None:
+    """Note in a run's folder the steps that it is resumed with, where they are others."""
+    kept = RunConfig(**json.loads((folder / CONFIG).read_text()))
+    if kept.total_timesteps == config.total_timesteps:
+        return
+    if command and (folder / COMMAND).exists():
+        earlier = (folder / COMMAND).read_text()
+        atomic_write(folder / COMMAND, f"{earlier}{command}\n".encode())
+    atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
+
+
+def noted_command(folder: Path, command: str = "") -> str:
+    """Return what made a run, as one line of a shell; `command` where its folder does not say."""
+    if not (folder / COMMAND).exists():
+        return command
+    return " && ".join((folder / COMMAND).read_text().splitlines())
+
+
+def finished_result(folder: Path, config: RunConfig) -> dict[str, Any] | None:
+    """Return the result of a run that has had its steps; None for one that can go on.
+
+    Raises:
+        ValueError: it ended after fewer and kept no checkpoint to go on from.
+    """
+    if not (folder / RESULT).exists():
+        return None
+    result = read_result(folder)
+    if result["env_steps"] >= config.total_timesteps:
+        return result
+    if not checkpoint_files(folder):
+        raise ValueError(
+            f"the run in {folder} ended after {result['env_steps']} env steps and kept no "
+            "checkpoint to go on from; one started with --set keep_last_checkpoint=true keeps it"
+        )
+    return None
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """Return the content of a run's result.json.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    path = folder / RESULT
+    try:
+        result = json.loads(path.read_text())
+        for name, kind in _RESULT.items():
+            result[name] = kind(result[name])
+        return dict(result)
+    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not the result of a run ({error})") from error
+
+
+def source_commit() -> str | None:
+    """Return the commit of the package's source tree; None for an installed wheel."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        run = subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return run.stdout.strip()
+
+
+def trained_steps(folder: str | os.PathLike[str]) -> int | None:
+    """Return the env steps that a run folder's training took; None where it does not say."""
+    folder = Path(folder)
+    if (folder / RESULT).exists():
+        return int(read_result(folder)["env_steps"])
+    if (folder / EVALUATIONS).exists():
+        rows = (folder / EVALUATIONS).read_text().splitlines()[1:]
+        try:
+            return int(rows[-1].split(",")[0]) if rows else None
+        except ValueError as error:
+            raise ValueError(f"{folder / EVALUATIONS} is damaged: {error}") from error
+    return None

@@ -1,0 +1,388 @@
+"""h_max is tested, k_max advances, tests are counted and stored, evaluations are written."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import toy
+from stable_baselines3 import DDPG, SAC, TD3, HerReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
+
+from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
+from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
+from sb3_follow_object.imagination.curriculum import Curriculum
+from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
+from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
+
+N = 4
+
+
+def bare(n: int = N) -> VecEnv:
+    return DummyVecEnv([toy.PointEnv] * n)
+
+
+def imagining(curriculum: Curriculum, mode: str = "train", n: int = N) -> ImaginedGoalVecEnv:
+    venv = ImaginedGoalVecEnv(bare(n), toy.StraightPredictor(), curriculum, mode)
+    venv.seed(0)
+    return venv
+
+
+def learner(env: VecEnv, algorithm: Any = DDPG, **options: Any) -> Any:
+    defaults: dict[str, Any] = {
+        "replay_buffer_class": HerReplayBuffer,
+        "learning_starts": 10**9,  # no updates: actions are random, tests play the first policy
+        "train_freq": (toy.HORIZON, "step"),
+        "buffer_size": 4000,
+        "policy_kwargs": {"net_arch": [32, 32]},
+        "gamma": 0.9,
+        "seed": 0,
+    }
+    return algorithm("MultiInputPolicy", env, **{**defaults, **options})
+
+
+class Watch(BaseCallback):
+    """Note values at the end of each rollout, after the callbacks before it."""
+
+    def __init__(self, look: Any) -> None:
+        super().__init__()
+        self.look = look
+        self.seen: list[Any] = []
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.seen.append(self.look(self.model))
+
+
+def test_threshold_zero_advances_once_a_cycle_until_finished() -> None:
+    curriculum = toy.curriculum(threshold=0.0, k_max=7)
+    callback = CurriculumCallback(imagining(curriculum, "test"), N)
+    watch = Watch(lambda model: (curriculum.k_max, callback.test_steps))
+    cycle = N * toy.HORIZON
+    # The budget counts the three tests too.
+    learner(imagining(curriculum)).learn((6 + 3) * cycle, callback=[callback, watch])
+    # Once finished, nothing is tested any more.
+    assert watch.seen == [
+        (8, cycle),
+        (9, 2 * cycle),
+        (10, 3 * cycle),
+        (10, 3 * cycle),
+        (10, 3 * cycle),
+        (10, 3 * cycle),
+    ]
+
+
+def test_failing_tests_keep_k_max() -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    callback = CurriculumCallback(imagining(curriculum, "test"), N)
+    learner(imagining(curriculum)).learn(3 * N * toy.HORIZON, callback=callback)
+    assert curriculum.k_max == 6
+
+
+def test_a_cycle_needs_a_finished_episode() -> None:
+    """Stock SB3 ends a rollout after every step by default."""
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    callback = CurriculumCallback(imagining(curriculum, "test"), N, every=2)
+    model = learner(imagining(curriculum), train_freq=1)
+    model.learn((7 + 3) * N * toy.HORIZON, callback=callback)
+    assert callback.test_steps == 3 * N * toy.HORIZON
+    assert model.num_timesteps == (7 + 3) * N * toy.HORIZON
+    assert model.replay_buffer.pos == (7 + 3) * toy.HORIZON
+
+
+def test_tests_are_stored_as_whole_episodes_with_scaled_actions() -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6, p=1.0)
+    test_env = imagining(curriculum, "test")
+    test_env.action_space.high[:] = 2.0  # SB3 stores 2.0 as 1.0
+    test_env.action_space.low[:] = -2.0
+    train_env = imagining(curriculum)
+    train_env.action_space = test_env.action_space
+    model = learner(train_env, replay_buffer_kwargs={"copy_info_dict": True})
+    model.learn(2 * 3 * N * toy.HORIZON, callback=CurriculumCallback(test_env, 2 * N))
+    buffer = model.replay_buffer
+    assert buffer.pos == 2 * 3 * toy.HORIZON
+    assert (buffer.ep_length[: buffer.pos] == toy.HORIZON).all()
+    np.testing.assert_array_equal(
+        buffer.ep_start[: buffer.pos, 0], np.repeat(np.arange(6) * 10, 10)
+    )
+    assert (buffer._current_ep_start == buffer.pos).all()
+    levels = [infos[0]["imagined_level"] for infos in buffer.infos[: buffer.pos]]
+    assert levels == 2 * ([0] * 10 + [6] * 20)
+    # The stored transitions are what the noise-free policy does at h_max.
+    rows = slice(toy.HORIZON, 3 * toy.HORIZON)
+    obs = {key: value[rows, 0] for key, value in buffer.observations.items()}
+    actions = model.predict(obs, deterministic=True)[0]
+    np.testing.assert_allclose(buffer.actions[rows, 0], actions / 2.0, atol=1e-6)
+    np.testing.assert_array_equal(
+        buffer.rewards[rows],
+        toy.PointEnv().compute_reward(
+            buffer.next_observations["achieved_goal"][rows],
+            buffer.next_observations["desired_goal"][rows],
+            {},
+        ),
+    )
+    # The next observation of an episode's end is its own, not the next episode's start.
+    moved = buffer.next_observations["observation"] - buffer.observations["observation"]
+    assert np.abs(moved[: buffer.pos]).max() <= toy.STEP + 1e-9
+    # A horizon's end is no terminal state.
+    assert not (buffer.dones * (1 - buffer.timeouts))[: buffer.pos].any()
+
+
+@pytest.mark.parametrize(
+    ("n_test", "train_freq", "store"), [(3, 10, True), (N, 15, True), (N, 10, False)]
+)
+def test_tests_are_not_stored_where_they_would_mix_episodes(
+    n_test: int, train_freq: int, store: bool
+) -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    callback = CurriculumCallback(imagining(curriculum, "test", n_test), 2, store=store)
+    model = learner(imagining(curriculum), train_freq=train_freq)
+    model.learn(train_freq * N, callback=callback)
+    assert model.replay_buffer.pos == train_freq
+    assert callback.test_steps == n_test * toy.HORIZON
+
+
+def test_test_episodes_of_unequal_length_do_not_run_into_the_training() -> None:
+    class EndsOnGoal(toy.PointEnv):
+        def step(self, action: np.ndarray) -> Any:
+            obs, reward, _, truncated, info = super().step(action)
+            return obs, reward, self.steps >= 3 + len(str(self.goal[0])) % 5, truncated, info
+
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    inner = DummyVecEnv([EndsOnGoal] * N)
+    test_env = ImaginedGoalVecEnv(inner, toy.StraightPredictor(), curriculum, "test")
+    model = learner(imagining(curriculum))
+    model.learn(300, callback=CurriculumCallback(test_env, 3 * N))
+    buffer = model.replay_buffer
+    assert (buffer._current_ep_start == buffer.pos).all()
+    assert (buffer.ep_length[: buffer.pos] > 0).all()
+    for env in range(N):  # the goal never changes within what the buffer takes for an episode
+        goals = buffer.observations["desired_goal"][: buffer.pos, env]
+        starts = buffer.ep_start[: buffer.pos, env]
+        same_episode = starts[1:] == starts[:-1]
+        assert (goals[1:] == goals[:-1]).all(axis=1)[same_episode].all()
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3, SAC])
+def test_stock_algorithms_climb_the_curriculum(algorithm: Any) -> None:
+    class StopAtLevel(BaseCallback):
+        def _on_step(self) -> bool:
+            return curriculum.k_max < 7
+
+    curriculum = toy.curriculum()
+    callback = CurriculumCallback(imagining(curriculum, "test"), N)
+    model = learner(
+        imagining(curriculum),
+        algorithm,
+        learning_starts=400,
+        gradient_steps=40,
+        batch_size=128,
+        learning_rate=3e-3,
+        tau=0.02,
+        policy_kwargs={"net_arch": [64, 64]},
+    )
+    model.learn(8000, callback=[callback, StopAtLevel()])
+    assert curriculum.k_max == 7  # the first policy reaches h_max at levels 1 and 2 only
+
+
+def test_curricula_inside_subprocesses_follow() -> None:
+    curriculum = toy.curriculum(threshold=0.0, p=0.0)
+
+    def make() -> ImaginedGoalWrapper:
+        return ImaginedGoalWrapper(toy.PointEnv(), toy.StraightPredictor(), toy.curriculum(p=0.0))
+
+    env = SubprocVecEnv([make] * 2)
+    try:
+        callback = CurriculumCallback(imagining(curriculum, "test"), N)
+        learner(env).learn(5 * (2 + N) * toy.HORIZON, callback=callback)
+        assert curriculum.k_max == 7
+        assert [copy.k_max for copy in env.get_attr("curriculum")] == [7, 7]
+    finally:
+        env.close()
+
+
+def test_observation_normalisers_are_applied_in_tests() -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    model = learner(VecNormalize(imagining(curriculum), norm_reward=False))
+    model.learn(4 * N * toy.HORIZON, callback=CurriculumCallback(imagining(curriculum, "test"), N))
+    buffer = model.replay_buffer
+    rows = slice(3 * toy.HORIZON, 4 * toy.HORIZON)
+    obs = {key: value[rows, 0] for key, value in buffer.observations.items()}
+    normaliser = model.get_vec_normalize_env()
+    actions = model.predict(normaliser.normalize_obs(obs), deterministic=True)[0]
+    np.testing.assert_allclose(buffer.actions[rows, 0], actions, atol=1e-5)
+
+
+def test_the_curriculum_callback_resumes() -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    first = CurriculumCallback(imagining(curriculum, "test"), N, every=3)
+    learner(imagining(curriculum)).learn((4 + 1) * N * toy.HORIZON, callback=first)
+    second = CurriculumCallback(imagining(curriculum, "test"), N, every=3)
+    second.load_state_dict(json.loads(json.dumps(first.state_dict())))
+    assert second.test_steps == N * toy.HORIZON
+    learner(imagining(curriculum)).learn(2 * N * toy.HORIZON, callback=second)
+    assert second.test_steps == 2 * N * toy.HORIZON  # cycles 3 and 6 of the whole run
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n_episodes": 0}, "n_episodes is 0; it must be at least 1"),
+        ({"every": 0}, "every is 0; it must be at least 1"),
+    ],
+)
+def test_bad_counts_are_refused(options: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        CurriculumCallback(imagining(toy.curriculum(), "test"), **{"n_episodes": 1, **options})
+
+
+def test_a_test_env_must_show_h_max() -> None:
+    for env in (imagining(toy.curriculum()), bare()):
+        with pytest.raises(ValueError, match="mode='test'"):
+            CurriculumCallback(env, 1)  # type: ignore[arg-type]
+
+
+def test_a_test_env_must_share_the_curriculum() -> None:
+    callback = CurriculumCallback(imagining(toy.curriculum(), "test"), N)
+    with pytest.raises(ValueError, match="the Curriculum object that the training has"):
+        learner(imagining(toy.curriculum())).learn(10, callback=callback)
+    with pytest.raises(ValueError, match="imagines no goals"):
+        learner(bare()).learn(10, callback=callback)
+
+
+def test_a_loaded_model_goes_on_at_its_k_max_with_a_test_env(tmp_path: Path) -> None:
+    curriculum = toy.curriculum(threshold=0.0, k_max=5)
+    model = learner(imagining(curriculum))
+    model.learn(2 * N * toy.HORIZON, callback=CurriculumCallback(imagining(curriculum, "test"), N))
+    assert curriculum.k_max == 6
+    model.save(tmp_path / "model")
+    begun = toy.curriculum(threshold=1.0, k_max=2)
+    loaded = DDPG.load(tmp_path / "model", env=imagining(begun))
+    loaded.learn(10, callback=CurriculumCallback(imagining(begun, "test"), N))
+    assert begun.k_max == 6
+    assert loaded.curriculum_state["k_max"] == 6
+
+
+def test_learning_again_counts_anew_and_tests_an_episode_of_every_copy(tmp_path: Path) -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    callback = CurriculumCallback(imagining(curriculum, "test"))
+    evaluation = OriginalGoalEvalCallback(bare(), N, 80)
+    model = learner(imagining(curriculum))
+    for n in (1, 2):
+        model.learn(2 * N * toy.HORIZON, callback=[callback, evaluation])
+        assert callback.test_steps == N * toy.HORIZON
+        assert evaluation.n_evaluations == n
+
+
+# Evaluation
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_evaluations_count_every_step_and_show_original_goals(tmp_path: Path) -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    test = CurriculumCallback(imagining(curriculum, "test"), N)
+    path = tmp_path / "eval.csv"
+    evaluation = OriginalGoalEvalCallback(
+        bare(), 10, 160, path, curriculum_callback=test, object_steps=1000
+    )
+    model = learner(imagining(curriculum))
+    model.learn(320, callback=[test, evaluation])
+    found = rows(path)
+    assert tuple(found[0]) == OriginalGoalEvalCallback.COLUMNS
+    assert [int(row["train_steps"]) for row in found] == [80, 160]
+    assert [int(row["test_steps"]) for row in found] == [80, 160]
+    assert [int(row["env_steps"]) for row in found] == [1160, 1320]
+    assert {row["episodes"] for row in found} == {"10"}
+    assert {row["k_max"] for row in found} == {"6"}
+    assert float(found[0]["wall_s"]) <= float(found[1]["wall_s"])
+    assert 0 <= float(found[-1]["success_rate"]) <= 1
+    assert evaluation.env_steps == 160 + 160 + 1000
+
+
+def test_a_policy_that_flies_to_its_goal_succeeds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def to_the_goal(self: Any, obs: dict[str, np.ndarray], **_: Any) -> Any:
+        way = (obs["desired_goal"] - obs["achieved_goal"]) / toy.STEP
+        return np.clip(way, -1, 1).astype(np.float32), None
+
+    evaluation = OriginalGoalEvalCallback(bare(), 10, 40, tmp_path / "eval.csv")
+    model = learner(bare())
+    monkeypatch.setattr(DDPG, "predict", to_the_goal)
+    model.learn(40, callback=evaluation)
+    assert evaluation.success_rate == 1.0
+    (row,) = rows(tmp_path / "eval.csv")
+    assert row["success_rate"] == "1.0"
+    assert -7 <= float(row["mean_return"]) <= -2
+    assert row["k_max"] == ""
+
+
+def test_each_evaluation_has_fresh_episodes() -> None:
+    goals: list[np.ndarray] = []
+
+    class Noting(toy.PointEnv):
+        def reset(self, **options: Any) -> Any:
+            obs, info = super().reset(**options)
+            goals.append(self.goal)
+            return obs, info
+
+    evaluation = OriginalGoalEvalCallback(DummyVecEnv([Noting] * 2), 4, 40)
+    learner(bare()).learn(120, callback=evaluation)
+    assert len(goals) >= 12
+    assert len(np.unique(np.array(goals), axis=0)) == len(goals)
+
+
+def test_a_resumed_evaluation_goes_on_with_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "eval.csv"
+    first = OriginalGoalEvalCallback(bare(), N, 80, path)
+    model = learner(bare())
+    model.learn(160, callback=first)
+    state = json.loads(json.dumps(first.state_dict()))
+    kept = rows(path)
+    # The run goes on, writes a row, and is then killed: its last saved state is the one above.
+    model.learn(80, callback=first, reset_num_timesteps=False)
+    assert [row["train_steps"] for row in rows(path)] == ["80", "160", "240"]
+    second = OriginalGoalEvalCallback(bare(), N, 80, path)
+    second.load_state_dict(state)
+    resumed = learner(bare())
+    resumed.num_timesteps = 160
+    resumed.learn(120, callback=second, reset_num_timesteps=False)
+    found = rows(path)
+    assert found[:2] == kept
+    assert [row["train_steps"] for row in found] == ["80", "160", "240"]
+    assert float(found[2]["wall_s"]) >= float(kept[1]["wall_s"])
+
+
+def test_another_runs_file_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "eval.csv"
+    learner(bare()).learn(80, callback=OriginalGoalEvalCallback(bare(), N, 80, path))
+    written = path.read_bytes()
+    with pytest.raises(ValueError, match="holds another run's evaluations"):
+        learner(bare()).learn(80, callback=OriginalGoalEvalCallback(bare(), N, 80, path))
+    assert path.read_bytes() == written
+    path.write_text("my notes")
+    with pytest.raises(ValueError, match="not a file of evaluations"):
+        learner(bare()).learn(80, callback=OriginalGoalEvalCallback(bare(), N, 80, path))
+    assert path.read_text() == "my notes"
+
+
+@pytest.mark.parametrize("options", [{"n_episodes": 0}, {"every_steps": 0}, {"object_steps": -1}])
+def test_bad_evaluation_settings_are_refused(options: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        OriginalGoalEvalCallback(bare(), **{"n_episodes": 1, "every_steps": 1, **options})
+
+
+def test_an_evaluation_in_vec_normalize_is_refused() -> None:
+    with pytest.raises(ValueError, match="eval_env is in VecNormalize"):
+        OriginalGoalEvalCallback(VecNormalize(bare()), 1, 1)

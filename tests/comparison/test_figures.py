@@ -1,0 +1,132 @@
+"""The paper's figures: written for whole and for broken grids, and true to them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from matplotlib.figure import Figure
+from result_folders import write_grid, write_run
+
+from sb3_follow_object.command.cli import main
+from sb3_follow_object.comparison.cross import CROSS_TESTS, cross_test, read_cross_tests
+from sb3_follow_object.comparison.figures import (
+    FINAL_SUCCESS,
+    OTHER_TASKS,
+    PNP_SIMPLE,
+    draw_results,
+)
+from sb3_follow_object.envs import TASKS
+
+PNG = b"\x89PNG"
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures in the order in which they were saved."""
+    figures: list[Figure] = []
+    save = Figure.savefig
+
+    def keep(self: Figure, *args: Any, **options: Any) -> None:
+        figures.append(self)
+        save(self, *args, **{**options, "dpi": 30})
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    return figures
+
+
+def texts(figure: Figure) -> list[str]:
+    return [text.get_text() for axis in figure.axes for text in axis.texts]
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    for seed in range(2):
+        write_run(tmp_path, "PnPShelf", "fo", seed, 0.9)
+        run = write_run(tmp_path, "PnPSimpleV1", "her", seed, 1.0)
+        cross = {"PnPSimpleV2": {"success_rate": 0.8 + 0.1 * seed, "episodes": 8}}
+        (run / CROSS_TESTS).write_text(json.dumps(cross))
+    write_run(tmp_path, "PnPSimpleV2", "her", 0)
+    write_grid(tmp_path, {"PnPShelf-her-0": {"failures": 2, "error": "diverged"}})
+    return tmp_path
+
+
+def test_figures_are_written(results: Path, drawn: list[Figure]) -> None:
+    paths = draw_results(results, results / "out")
+    assert len(paths) == 4
+    assert all(path.read_bytes().startswith(PNG) for path in paths)
+    names = [axis.get_title() for axis in drawn[1].axes]
+    assert names == [task for task in TASKS if not task.startswith("PnPSimple")]
+    assert [path.name for path in paths[:2]] == [PNP_SIMPLE, OTHER_TASKS]
+
+
+def test_command_draws_them_where_it_is_told(
+    results: Path, tmp_path: Path, drawn: list[Figure], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "figures"
+    assert main(["plot", "--results", str(results), "--out", str(out)]) == 0
+    assert set(capsys.readouterr().out.splitlines()) == {*map(str, out.iterdir())}
+    assert main(["plot"]) == 2
+    assert main(["plot", str(results), "--results", str(results)]) == 2
+    assert "either run folders or --results" in capsys.readouterr().err
+
+
+def test_cross_test_is_drawn_with_what_is_missing(results: Path, drawn: list[Figure]) -> None:
+    draw_results(results, results / "out", methods=("fo", "her"))
+    panel = drawn[0].axes[0]
+    assert [text.get_text() for text in panel.texts] == ["1.00", "0.85", "unfinished", "unfinished"]
+    hatched = [bool(bar.get_hatch()) for bar in panel.patches]
+    assert hatched == [False, False, True, True]
+
+
+def test_unfinished_runs_are_dotted_and_missing_methods_named(
+    results: Path, drawn: list[Figure]
+) -> None:
+    draw_results(results, results / "out", methods=("fo", "her", "rival"))
+    v2 = drawn[0].axes[2]
+    assert [line.get_linestyle() for line in v2.lines] == [":"]
+    assert [text.get_text() for text in v2.texts] == ["not run: fo, rival; unfinished: her"]
+    shelf = next(axis for axis in drawn[1].axes if axis.get_title() == "PnPShelf")
+    assert [text.get_text() for text in shelf.texts] == ["failed: her; not run: rival"]
+    empty = next(axis for axis in drawn[1].axes if axis.get_title() == "PnPObstacle")
+    assert not empty.lines
+    assert [bool(patch.get_hatch()) for patch in empty.patches] == [True]
+
+
+def test_matrix_of_final_success_has_a_text_in_every_cell(
+    results: Path, drawn: list[Figure]
+) -> None:
+    draw_results(results, results / "out", methods=("fo", "her", "rival"))
+    cells = texts(drawn[3])
+    assert len(cells) == 3 * len(TASKS)
+    assert cells.count("0.90 (2)") == 1
+    assert cells.count("failed") == 1
+    assert cells.count("unfinished") == 1
+    assert (results / "out" / FINAL_SUCCESS).exists()
+
+
+def test_cross_test_keeps_the_figure_and_refuses_what_cannot_be(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Half:
+        success_rate = 0.5
+
+    asked: list[Any] = []
+
+    def evaluate(*arguments: Any) -> type[Half]:
+        asked.append(arguments)
+        return Half
+
+    monkeypatch.setattr("sb3_follow_object.comparison.cross.evaluate", evaluate)
+    run = results / "PnPSimpleV2-her-0"
+    assert cross_test(run, "FollowObject/PnPSimpleV1-v0", 12) == 0.5
+    assert asked[0][1:] == ("FollowObject/PnPSimpleV1-v0", 12, 0)
+    assert cross_test(run, "FollowObject/PnPSimpleV1-v0", 4) == 0.5, "kept is the longer test"
+    assert read_cross_tests(run) == {"PnPSimpleV1": {"success_rate": 0.5, "episodes": 12}}
+    with pytest.raises(ValueError, match="did you mean 'FollowObject/PnPSimpleV1-v0'"):
+        cross_test(run, "FollowObject/PnPSimplV1-v0")
+    (run / CROSS_TESTS).write_text("[1]")
+    with pytest.raises(ValueError, match="is not a file of cross tests"):
+        read_cross_tests(run)

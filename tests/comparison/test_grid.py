@@ -1,0 +1,172 @@
+"""A comparison's plan: which runs, what is refused, and how object stages are shared."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sb3_follow_object.comparison.grid import (
+    Ledger,
+    Settings,
+    plan,
+    prepare,
+    read_grid,
+    shared_stage,
+    stage_settings,
+)
+from sb3_follow_object.runs.object_stage_files import OBJECT_STAGE
+from sb3_follow_object.runs.run_folder import CONFIG, RESULT, noted_command
+from sb3_follow_object.settings.methods import METHODS
+from sb3_follow_object.settings.presets import load_config
+
+SETTINGS = Settings(steps=1000, overrides={"n_envs": 2})
+
+
+def test_plan_is_the_whole_grid_a_seed_after_the_other(tmp_path: Path) -> None:
+    cells = plan(tmp_path, ["PnPShelf", "PushSideGap"], ["her", "fo"], [3, 1, 3], SETTINGS)
+    assert [cell.name for cell in cells] == [
+        f"{task}-{method}-{seed}"
+        for seed in (3, 1)
+        for task in ("PnPShelf", "PushSideGap")
+        for method in ("her", "fo")
+    ]
+    assert {cell.config.total_timesteps for cell in cells} == {1000}
+    assert {cell.config.settings["n_envs"] for cell in cells} == {2}
+    assert not list(tmp_path.iterdir()), "planning wrote something"
+
+
+def test_ids_and_short_names_are_one_task_and_others_keep_their_id(tmp_path: Path) -> None:
+    tasks = ["FollowObject/PnPShelf-v0", "PnPShelf", "FetchReach-v4"]
+    cells = plan(tmp_path, tasks, ["her"], [0], SETTINGS)
+    assert [cell.name for cell in cells] == ["PnPShelf-her-0", "FetchReach-v4-her-0"]
+
+
+def test_command_trains_the_same_run(tmp_path: Path) -> None:
+    settings = Settings(1000, "default", {"curriculum.p": 0.5}, paper_evaluation=True)
+    (cell,) = plan(tmp_path, ["PushDoubleObstacles"], ["fo"], [4], settings)
+    assert cell.config.eval_every == 1900 * 80
+    assert cell.config.n_eval_episodes == 380
+    words = (
+        "--method fo --seed 4 --threads 1 --steps 1000 --set eval_every=152000 n_eval_episodes=380"
+    )
+    assert f"{words} curriculum.p=0.5" in cell.command
+
+
+def test_every_method_can_be_planned(tmp_path: Path) -> None:
+    cells = plan(tmp_path, ["PnPSimpleV2"], METHODS, [0], SETTINGS)
+    assert [cell.method for cell in cells] == list(METHODS)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "methods", "sentence"),
+    [
+        (["PnPShelv"], ["fo"], "there is no task 'PnPShelv'; did you mean 'PnPShelf'"),
+        (["FollowObject/PnPShelv-v0"], ["fo"], "did you mean 'FollowObject/PnPShelf-v0'"),
+        (["PnPShelf"], ["hers"], "there is no method 'hers'; did you mean 'her'"),
+        (["CartPole-v1"], ["her"], "'CartPole-v1' has no goals"),
+        (["FetchReach-v4"], ["fo"], "'FetchReach-v4'"),
+    ],
+)
+def test_names_that_mean_nothing_are_refused(
+    tmp_path: Path, tasks: list[str], methods: list[str], sentence: str
+) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        plan(tmp_path, tasks, methods, [0], SETTINGS)
+
+
+def test_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
+    cells = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS)
+    Ledger(tmp_path, SETTINGS, cells)
+    with pytest.raises(ValueError, match="was compared with steps 1000, not 2000"):
+        plan(tmp_path, ["PnPShelf"], ["fo"], [0], Settings(2000, overrides={"n_envs": 2}))
+    with pytest.raises(ValueError, match=r"with set.n_envs 2, not 4"):
+        plan(tmp_path, ["PnPShelf"], ["her"], [1], Settings(1000, overrides={"n_envs": 4}))
+
+
+def test_run_of_other_settings_is_refused_without_a_grid_file(tmp_path: Path) -> None:
+    (cell,) = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS)
+    prepare(cell, None)
+    other = Settings(1000, overrides={"n_envs": 4})
+    with pytest.raises(ValueError, match=r"PnPShelf-her-0 has settings.n_envs 2, not 4"):
+        plan(tmp_path, ["PnPShelf"], ["her"], [0], other)
+    plan(tmp_path, ["PnPShelf"], ["her"], [1], other)  # another run may have them
+    (tmp_path / "PnPShelf-her-1").mkdir()
+    (tmp_path / "PnPShelf-her-1" / "notes").write_text("mine")
+    with pytest.raises(ValueError, match="is not empty but holds no run"):
+        plan(tmp_path, ["PnPShelf"], ["her"], [1], other)
+
+
+def test_run_is_resumed_with_the_threads_it_began_with(tmp_path: Path) -> None:
+    (cell,) = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS, threads=3)
+    prepare(cell, None)
+    (again,) = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS, threads=1)
+    assert again.config == cell.config
+    assert again.config.torch_threads == 3
+
+
+def test_run_keeps_the_command_that_its_settings_come_from(tmp_path: Path) -> None:
+    """Also where `train --resume` ends it."""
+    (cell,) = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS)
+    prepare(cell, None)
+    assert "--method her" in cell.command
+    assert noted_command(cell.folder, "train --resume") == cell.command
+
+
+def test_damaged_grid_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "grid.json").write_text('{"format": 1, "cells": {"a": 3}}')
+    with pytest.raises(ValueError, match="is not the file of a comparison's grid"):
+        read_grid(tmp_path)
+
+
+def test_grid_file_keeps_earlier_cells_and_failures(tmp_path: Path) -> None:
+    first = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS)
+    ledger = Ledger(tmp_path, SETTINGS, first)
+    ledger.note_failure("PnPShelf-her-0", "once")
+    assert not ledger.failed("PnPShelf-her-0")
+    ledger.note_failure("PnPShelf-her-0", "twice")
+    second = plan(tmp_path, ["PnPShelf"], ["her"], [1], SETTINGS)
+    later = Ledger(tmp_path, SETTINGS, second)
+    assert later.failed("PnPShelf-her-0")
+    assert not later.failed("PnPShelf-her-1")
+    assert not Ledger(tmp_path, SETTINGS, first, retry_failed=True).failed("PnPShelf-her-0")
+    assert set(json.loads((tmp_path / "grid.json").read_text())["cells"]) == {
+        "PnPShelf-her-0",
+        "PnPShelf-her-1",
+    }
+
+
+def test_object_stage_is_one_for_a_task_and_seed_and_copied_with_its_cost(tmp_path: Path) -> None:
+    fo, her, other = plan(tmp_path, ["PnPShelf"], ["fo", "her"], [0, 1], SETTINGS)[:3]
+    assert shared_stage(her) is None
+    stage = shared_stage(fo)
+    assert stage == tmp_path / "object" / "PnPShelf-0"
+    assert shared_stage(other) == tmp_path / "object" / "PnPShelf-1"
+    (stage / "predictor").mkdir()
+    (stage / "predictor" / "predictor.json").write_text("{}")
+    (stage / "checkpoint-7.safetensors").write_text("of the object's own training")
+    (stage / OBJECT_STAGE).write_text('{"object_steps": 7}')
+    prepare(fo, stage)
+    names = {path.relative_to(fo.folder).as_posix() for path in fo.folder.rglob("*")}
+    assert names >= {CONFIG, OBJECT_STAGE, "predictor/predictor.json"}
+    assert "checkpoint-7.safetensors" not in names
+    assert load_config(fo.folder) == fo.config
+    assert shared_stage(fo) is None, "a run that has begun keeps what it has"
+
+
+def test_stage_of_other_settings_is_not_shared(tmp_path: Path) -> None:
+    (cell,) = plan(tmp_path, ["PnPShelf"], ["fo"], [0], SETTINGS)
+    assert shared_stage(cell) is not None
+    other = Settings(1000, overrides={"n_envs": 2, "object_timesteps": 77})
+    (differs,) = plan(tmp_path, ["PnPShelf"], ["fo"], [0], other)
+    assert stage_settings(differs.config) != stage_settings(cell.config)
+    assert shared_stage(differs) is None
+
+
+def test_finished_run_stays_finished(tmp_path: Path) -> None:
+    (cell,) = plan(tmp_path, ["PnPShelf"], ["her"], [0], SETTINGS)
+    prepare(cell, None)
+    assert not cell.finished
+    (cell.folder / RESULT).write_text("{}")
+    assert cell.finished
