@@ -55,6 +55,23 @@ class ZooHerDDPG(HerDDPG):
         check_keywords("HerDDPG", settings, HerDDPG.__init__)
         super().__init__(policy, env, **settings)
 
+    def learn(
+        self, total_timesteps: int, callback: Any = None, *args: Any, **kwargs: Any
+    ) -> ZooHerDDPG:
+        """Learn; arguments as in SB3.
+
+        Raises:
+            ValueError: this was a trial of -optimize, which ended before rl_zoo3 evaluated it.
+        """
+        super().learn(total_timesteps, callback, *args, **kwargs)
+        last = callback[-1] if isinstance(callback, list) and callback else None
+        if getattr(last, "eval_idx", None) == 0:
+            raise ValueError(
+                "the trial ended before its first evaluation, because a curriculum's tests are "
+                "among its steps: give --n-evaluations 4 or more"
+            )
+        return self
+
     @classmethod
     def load(cls, path: Any, env: Any = None, *args: Any, **kwargs: Any) -> ZooHerDDPG:
         """Load a model; arguments as in SB3. Without an environment it can act, not learn."""
@@ -190,6 +207,8 @@ def _tell_missing_files() -> None:
         try:
             return str(download(repo_id, filename))
         except missing as error:
+            if isinstance(error, FileNotFoundError):  # the hub was not reached
+                raise
             raise http_error(str(error)) from error
 
     sb3.load_from_hub = load_from_hub
