@@ -8,7 +8,7 @@ INSTALLED := $(VENV)/.installed
 ENV ?= FollowObject/PnPShelf-v0
 RUN ?= runs/pnp-shelf
 
-.PHONY: train test lint bench test-mujoco-range clean
+.PHONY: train test lint bench test-mujoco-range test-foreign clean
 
 train: $(INSTALLED)
 	$(BIN)/sb3-follow-object train --env $(ENV) --run $(RUN) --set torch_threads=2 --resume-or-start
@@ -19,6 +19,10 @@ test: lint
 # Builds throwaway environments with the lowest and the highest mujoco that pyproject.toml admits.
 test-mujoco-range: $(INSTALLED)
 	$(BIN)/pytest -q -m mujoco_range
+
+# Downloads the tests of Stable-Baselines3 and Gymnasium-Robotics, and runs them over this package.
+test-foreign: $(INSTALLED)
+	$(BIN)/python benchmarks/foreign_tests.py
 
 # Against stock SB3, Gymnasium-Robotics and EnvPool; two minutes on a machine left alone.
 bench: $(INSTALLED)

@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import (
     TrainFreq,
     TrainFrequencyUnit,
 )
+from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped
 
 from ..common.torch_helpers import matmul_at, threads_at
 from ..replay.device_replay import device_replay_of
@@ -89,8 +90,9 @@ class HerDDPG(DDPG):
     The other arguments are DDPG's.
 
     Raises:
-        ValueError: for an environment without goals or in VecNormalize, an argument outside its
-            range, or, at the first update, rewards above 0 with `target_clip` "auto".
+        ValueError: for an environment without goals, in VecNormalize or in VecFrameStack, an
+            argument outside its range, or, at the first update, rewards above 0 with `target_clip`
+            "auto" or others than -1 and 0 with `hindsight_bound`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": HerPolicy}
@@ -203,6 +205,11 @@ class HerDDPG(DDPG):
             raise ValueError(
                 "HerDDPG standardises its inputs itself and knows the range of its rewards; leave "
                 "VecNormalize (rl_zoo3's normalize) out"
+            )
+        if self.env is not None and is_vecenv_wrapped(self.env, VecFrameStack):
+            raise ValueError(
+                "VecFrameStack (rl_zoo3's frame_stack) stacks goals too, for which the environment "
+                "has no reward; leave it out"
             )
         if self.auxiliary is not None:
             self.auxiliary = resolve_auxiliary(self.auxiliary, self.env)
@@ -397,11 +404,15 @@ class HerDDPG(DDPG):
             self._device_replay = None
 
     def _check_rewards(self, rewards: th.Tensor) -> None:
-        """Refuse rewards whose returns lie outside the bounds that "auto" stands for."""
+        """Refuse rewards for which "auto" or hindsight_bound would bound the targets wrongly."""
         if self.target_clip == "auto" and float(rewards.max()) > 0.0:
             raise ValueError(
                 f"a reward is {float(rewards.max()):g}; target_clip 'auto' is for none above "
                 "0: give (low, high), the bounds of the returns, or None"
+            )
+        if self.hindsight_bound and not bool(((rewards == 0.0) | (rewards == -1.0)).all()):
+            raise ValueError(
+                "hindsight_bound is for rewards of -1 and 0, and one is another; set it to false"
             )
 
     def _chunks(self, gradient_steps: int, batch_size: int) -> list[int]:

@@ -109,4 +109,4 @@ def test_unknown_command_is_one_line(
 ) -> None:
     assert zoo.main(arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "train or enjoy" in line
+    assert "give train, enjoy, record_video, load_from_hub or push_to_hub first" in line
