@@ -1,0 +1,114 @@
+"""Sizes that only make sense together, looked at before anything runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..common.numbers import checked_whole
+from ..envs import IDS
+from .fields import settings_of
+from .learning import AlgorithmSettings
+from .run_config import RunConfig
+from .stages import CurriculumSettings, StageSettings
+
+
+def check_buffer(buffer_size: int, n_envs: int, horizon: int, where: str = "") -> None:
+    """Raise a ValueError unless a replay buffer holds an episode of every environment.
+
+    Args:
+        buffer_size: transitions of all environments, as SB3 counts them.
+        n_envs: environments.
+        horizon: T, steps of an episode.
+        where: beginning of the sentence.
+    """
+    if buffer_size // n_envs < horizon:
+        raise ValueError(
+            f"{where}buffer_size is {buffer_size}; it must be at least {n_envs * horizon}, an "
+            f"episode of {horizon} steps in each of {n_envs} environments"
+        )
+
+
+def check_sizes(config: RunConfig) -> None:
+    """Raise a ValueError for a new run's settings that are fine alone but not together."""
+    horizon = IDS[config.env_id][0].horizon if config.env_id in IDS else None
+    check_stages(config.env_id, config.settings, horizon)
+    settings = {**_defaults(StageSettings), **config.settings}
+    _check_learning(settings["algorithm"], "", "n_timesteps", config.total_timesteps)
+    if _has_object_stage(settings):
+        steps = settings["object_timesteps"]
+        where = "object_algorithm: "
+        _check_learning(settings["object_algorithm"], where, "object_timesteps", steps)
+
+
+def check_stages(env_id: str, given: Mapping[str, Any], horizon: int | None) -> None:
+    """Raise a ValueError for settings of the stages that are fine alone but not together.
+
+    Args:
+        env_id: the task. What an episode's end decides is told of this package's own alone, whose
+            episodes all have the same length.
+        given: settings of `FollowObject`.
+        horizon: T, steps of an episode; None where that is not known.
+    """
+    settings = {**_defaults(StageSettings), **given}
+    whole = env_id in IDS
+    _check_algorithm(settings["algorithm"], settings["n_envs"], horizon, whole, "")
+    if _has_object_stage(settings):
+        where, n_envs = "object_algorithm: ", settings["object_n_envs"]
+        _check_algorithm(settings["object_algorithm"], n_envs, horizon, whole, where)
+        _check_object_networks(settings["object_algorithm"])
+    if settings["imagine"]:
+        curriculum = {**_defaults(CurriculumSettings), **(settings["curriculum"] or {})}
+        levels = horizon if curriculum["levels"] == "time" else curriculum["n_levels"]
+        checked_whole("curriculum: k_max", curriculum["k_max"], 1, levels)
+
+
+def _has_object_stage(settings: Mapping[str, Any]) -> bool:
+    auxiliary = (settings["algorithm"] or {}).get("auxiliary") or {}
+    return bool(settings["imagine"]) or auxiliary.get("name") == "sldr"
+
+
+def _check_algorithm(
+    given: Mapping[str, Any] | None, n_envs: int, horizon: int | None, whole: bool, where: str
+) -> None:
+    settings = {**_defaults(AlgorithmSettings), **(given or {})}
+    size, batch, starts = (settings[n] for n in ("buffer_size", "batch_size", "learning_starts"))
+    if batch > size:
+        raise ValueError(f"{where}batch_size is {batch}; it must be at most buffer_size, {size}")
+    if horizon is None:
+        return
+    check_buffer(size, n_envs, horizon, where)
+    frequency = settings["train_freq"]
+    steps, unit = frequency if isinstance(frequency, tuple) else (frequency, "step")
+    # SB3 learns after the first rollout that brings it beyond learning_starts.
+    rollouts = starts // (steps * n_envs) + 1
+    if whole and unit == "step" and steps * rollouts < horizon:
+        raise ValueError(
+            f"{where}learning_starts is {starts}; with train_freq {steps} and {n_envs} "
+            f"environments it must be at least {n_envs * horizon}, for before the end of an "
+            "episode there is nothing to learn from"
+        )
+
+
+def _check_learning(given: Mapping[str, Any] | None, where: str, name: str, total: int) -> None:
+    starts = (given or {}).get("learning_starts", AlgorithmSettings.learning_starts)
+    if starts >= total:
+        raise ValueError(
+            f"{where}learning_starts is {starts}; it must be less than {name}, {total}, or nothing "
+            "is learned"
+        )
+
+
+def _check_object_networks(given: Mapping[str, Any] | None) -> None:
+    """Raise a ValueError for networks that the files of SLDR's reward cannot hold."""
+    net_arch = ((given or {}).get("policy_kwargs") or {}).get("net_arch")
+    for widths in net_arch.values() if isinstance(net_arch, dict) else [net_arch]:
+        if widths == []:
+            raise ValueError(
+                "object_algorithm: policy_kwargs: net_arch is without a hidden layer; the object's "
+                "networks must have at least one"
+            )
+
+
+def _defaults(group: type) -> dict[str, Any]:
+    return {each.field: each.default for each in settings_of(group).values()}
