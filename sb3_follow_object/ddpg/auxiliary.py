@@ -205,7 +205,8 @@ def reward_class(settings: Mapping[str, Any]) -> type[AuxiliaryReward]:
     check_auxiliary(settings)
     name = settings["name"]
     if not isinstance(name, type):
-        return provider(KIND, name)  # type: ignore[no-any-return]
+        chosen: type[AuxiliaryReward] = provider(KIND, name)
+        return chosen
     if not issubclass(name, AuxiliaryReward):
         raise ValueError(f"auxiliary: {name.__name__} is no subclass of AuxiliaryReward")
     known = sorted({*inspect.signature(name.__init__).parameters} - {"self", *_GIVEN})

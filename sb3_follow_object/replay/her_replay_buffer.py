@@ -436,7 +436,9 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
 
 
-def _horizon(env: VecEnv) -> int | None:
+def _horizon(env: VecEnv | None) -> int | None:
     """Steps of an episode at most, from the environment's spec; None where that does not say."""
-    spec = env.get_attr("spec", indices=[0])[0] if env.has_attr("spec") else None
+    if env is None or not env.has_attr("spec"):
+        return None
+    spec = env.get_attr("spec", indices=[0])[0]
     return None if spec is None else spec.max_episode_steps

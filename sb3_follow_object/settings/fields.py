@@ -6,7 +6,7 @@ import dataclasses
 import types
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import (
     Annotated,
     Any,
@@ -91,7 +91,8 @@ class Setting:
             limits["allow_inf_nan"] = False
         elif self.kind == "a whole number":
             limits.setdefault("le", LARGEST)
-        return TypeAdapter(Annotated[(self.hint, Field(**limits))] if limits else self.hint)
+        hint: Any = Annotated[(self.hint, Field(**limits))] if limits else self.hint
+        return TypeAdapter(hint)
 
     @cached_property
     def kind(self) -> str:
@@ -164,11 +165,13 @@ class Group:
 
     Attributes:
         title: what tables call the group.
-        where: beginning of the sentence about a value that cannot be meant.
+        where: beginning of a sentence about an instance's value that cannot be meant.
+        of_name: what a sentence about data adds to the name of the mapping.
     """
 
     title: ClassVar[str] = ""
     where: ClassVar[str] = ""
+    of_name: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         for each in settings_of(type(self)).values():
@@ -183,9 +186,17 @@ class Group:
         return cls
 
 
-@cache
 def settings_of(group: type[Group]) -> dict[str, Setting]:
     """Return a group's settings by the names that they have in data."""
+    if group not in _FOUND:
+        _FOUND[group] = _read(group)
+    return _FOUND[group]
+
+
+_FOUND: dict[type[Group], dict[str, Setting]] = {}
+
+
+def _read(group: type[Group]) -> dict[str, Setting]:
     hints = get_type_hints(group, include_extras=True)
     found = {}
     for field in dataclasses.fields(group):  # type: ignore[arg-type]
@@ -216,12 +227,13 @@ _LIMITS = ("ge", "gt", "le", "lt")
 
 def _bare(hint: Any) -> Any:
     """Return a field's type without its description, and without None."""
-    origin, *metadata = hint.__origin__, *hint.__metadata__
-    metadata = [m for m in metadata if not isinstance(m, FieldInfo)]
+    origin = hint.__origin__
+    metadata = [each for each in hint.__metadata__ if not isinstance(each, FieldInfo)]
     if get_origin(origin) in (Union, types.UnionType):
         options = [option for option in get_args(origin) if option is not type(None)]
         (origin,) = options  # what else a value may be is for a type of its own to say
-    return Annotated[(origin, *metadata)] if metadata else origin
+    parts: Any = (origin, *metadata)
+    return Annotated[parts] if metadata else origin
 
 
 def check_names(given: Any, known: Collection[str], where: str) -> None:
@@ -255,6 +267,7 @@ def checked(
     group = group.of(given)
     if group is Anything:
         return dict(given)
+    where += group.of_name
     known = {
         name: each
         for name, each in settings_of(group).items()

@@ -15,9 +15,11 @@ from .kinds import (
     GradientSteps,
     Hidden,
     NetArch,
+    Networks,
     Policy,
     PythonClass,
     Rate,
+    Reward,
     Strategy,
     TargetClip,
     TrainFreq,
@@ -78,9 +80,7 @@ class ReplaySettings(Group):
     ] = 0.0
     cher: Annotated[
         dict[str, Any] | None,
-        setting(
-            "chooses each batch from more candidates", none="chooses nothing", group=CherSettings
-        ),
+        setting("chooses each batch from more candidates", none="none", group=CherSettings),
     ] = None
     reward_function: Annotated[
         Any, setting("f(achieved, desired, infos)", none="the environment's", data=False)
@@ -97,7 +97,7 @@ class AuxiliarySettings(Group):
 
     title = "`auxiliary`, of every second reward"
     where = "auxiliary"
-    name: Annotated[Any, setting("rnd or sldr, or a subclass of `AuxiliaryReward`")] = None
+    name: Annotated[Reward, setting("which reward it is", none="must be given")] = None
     weight: Annotated[
         Number, setting("of the reward's critic beside the main one for the actor", ge=0)
     ] = 1.0
@@ -123,7 +123,7 @@ class RndSettings(AuxiliarySettings):
     """A bonus for the unfamiliar."""
 
     title = "`auxiliary` with the name rnd, of `RndReward`"
-    where = "auxiliary (rnd)"
+    where, of_name = "auxiliary (rnd)", " (rnd)"
     hidden: Annotated[Hidden, setting("widths of the hidden layers of both networks")] = (256,) * 3
     n_outputs: Annotated[Whole, setting("of both networks", ge=1, le=8192)] = 256
     learning_rate: Annotated[Number, setting("of the predicting network's Adam", gt=0)] = 1e-3
@@ -135,15 +135,17 @@ class SldrSettings(AuxiliarySettings):
     """The reward of the object's own stage."""
 
     title = "`auxiliary` with the name sldr, of `SldrReward`"
-    where = "auxiliary (sldr)"
+    where, of_name = "auxiliary (sldr)", " (sldr)"
     object_networks: Annotated[
-        Any, setting('a file of them, or "auto"; a run makes them itself and takes none')
+        Networks, setting("what the reward reads; a run makes them itself and takes none")
     ] = "auto"
 
 
 @dataclass(frozen=True)
 class _AnyAuxiliarySettings(RndSettings, SldrSettings):
     """Where a change leaves out which reward it is of."""
+
+    of_name = ""
 
 
 @dataclass(frozen=True)
@@ -292,4 +294,4 @@ def check_auxiliary(given: Any) -> None:
     if not isinstance(given, Mapping) or "name" not in given:
         raise ValueError(f"auxiliary is {given!r}; give a mapping with a name, e.g. {{name: rnd}}")
     group = AuxiliarySettings.of(given)
-    checked(group, given, group.where)
+    checked(group, given, AuxiliarySettings.where)
