@@ -81,9 +81,10 @@ def run_config(
     settings = _flattened(entry, path)
     has_object_stage = imagine or _auxiliary_name(settings) == "sldr"
     if has_object_stage and env_id not in IDS:
+        robots = sorted(name for name, (_, alone) in IDS.items() if not alone)
         raise ValueError(
             f"{env_id!r} has no environment of its object alone, which imagined goals and SLDR's "
-            f"reward come from; train it with --method her, or one of {', '.join(sorted(IDS))}"
+            f"reward come from; train it with --method her, or one of {', '.join(robots)}"
         )
     if has_object_stage and _find(entries, object_id(env_id)) is not None:
         settings |= _object_stage(_entry(entries, object_id(env_id), path), path)
@@ -149,7 +150,7 @@ def load_config(folder: str | os.PathLike[str]) -> RunConfig:
     path = Path(folder) / CONFIG
     try:
         saved = json.loads(path.read_text())
-        config = RunConfig(**saved)
+        config = RunConfig(**{**saved, "settings": saved["settings"]})  # without, it is none
         import_task(config.full_id)
         return config
     except FileNotFoundError as error:
