@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from ..common.files import atomic_write
-from ..common.numbers import checked_whole, shown
+from ..common.numbers import checked_whole
 from ..common.torch_helpers import usable_device
 from ..settings.learning import PredictorSettings
 from .predictor_files import (
@@ -203,14 +203,15 @@ class GoalPredictor:
             )
         if n == 0:
             return np.zeros((0, POSITION))
-        if not np.issubdtype(k.dtype, np.integer):
-            raise ValueError(f"k must hold whole numbers, got {k.dtype} {shown(k[0])}.")
+        for name, values in (("start", start), ("goal", goal), ("k", k)):
+            if not (np.issubdtype(values.dtype, np.number) and np.isfinite(values).all()):
+                raise ValueError(f"{name} must hold finite numbers, got others in it.")
         if not (k.min() >= 1 and k.max() <= self.horizon):
             raise ValueError(
                 f"k must lie in 1..{self.horizon}, got values from {k.min()} to {k.max()}."
             )
-        if not (_is_finite(start) and _is_finite(goal)):
-            raise ValueError("start and goal must be finite numbers, got others in them.")
+        if (k != np.round(k)).any():
+            raise ValueError(f"k must hold whole numbers, got {k[k != np.round(k)][0]} in it.")
         inputs = np.concatenate([start, goal, k[:, None]], axis=1, dtype=np.float64)
         scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
         with torch.inference_mode():
@@ -371,7 +372,3 @@ def _checked_paths(paths: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np
     if not (np.isfinite(paths).all() and np.isfinite(goals).all()):
         raise ValueError("paths and goals must be finite, got NaN or infinity in them.")
     return paths, goals
-
-
-def _is_finite(values: np.ndarray) -> bool:
-    return np.issubdtype(values.dtype, np.number) and bool(np.isfinite(values).all())

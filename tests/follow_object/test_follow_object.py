@@ -142,9 +142,9 @@ def test_save_keeps_train_freq_and_refuses_python_objects(
     np.testing.assert_array_equal(weights(loaded), weights(run))
 
     kwargs = {"policy_kwargs": {"activation_fn": th.nn.Tanh}}
-    with pytest.warns(UserWarning, match="activation_fn is .* a Python object, which save"):
+    with pytest.warns(UserWarning, match=r"activation_fn is .* a Python object, which save"):
         run = FollowObject(ENV, imagine=False, **{**TINY, "algorithm": kwargs})
-    with pytest.raises(ValueError, match="activation_fn is .* a Python object, which save"):
+    with pytest.raises(ValueError, match=r"activation_fn is .* a Python object, which save"):
         run.save(tmp_path / "none")
     assert not (tmp_path / "none").exists()
 

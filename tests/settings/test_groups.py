@@ -116,7 +116,7 @@ def test_numpys_numbers_become_pythons(group: type[Group], each: Setting) -> Non
     with pytest.raises(ValueError, match=f"{each.field} must be {each.kind}"):
         given(group, each.field, np.bool_(True) if each.kind != "true or false" else np.int64(1))
     if each.kind == "a whole number":
-        with pytest.raises(ValueError, match="must be a whole number, not 5.0"):
+        with pytest.raises(ValueError, match=r"must be a whole number, not 5\.0"):
             given(group, each.field, 5.0)
     if each.kind == "a number":
         for bad in (np.nan, np.float32(np.inf), -np.inf):
@@ -208,7 +208,8 @@ def test_the_command_names_every_setting_with_range_and_default() -> None:
 )
 def test_configurations_of_earlier_runs_load_as_they_are(folder: Path) -> None:
     saved = json.loads(folder.read_text())
-    assert json.loads(json.dumps(asdict(load_config(folder.parent)))) == saved
+    loaded = json.loads(json.dumps(asdict(load_config(folder.parent))))
+    assert {name: loaded[name] for name in saved} == saved
 
 
 @pytest.mark.parametrize(
