@@ -30,9 +30,6 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
         ValueError: the id is unknown, an option is wrong or a count is below 1.
     """
     name = import_task(env_id)
-    n_envs = checked_whole("n_envs", n_envs, 1)
-    if n_threads is not None:
-        n_threads = checked_whole("n_threads", n_threads, 1)
     if name in IDS:
         face = ObjectVecEnv if IDS[name][1] else FetchVecEnv
         try:
@@ -41,6 +38,7 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
             raise ValueError(f"{env_id!r} cannot be made: {error}") from error
         return face(name, n_envs, n_threads, **options)
 
+    n_envs = checked_whole("n_envs", n_envs, 1)
     seed = options.pop("seed", None)
     try:
         venv = DummyVecEnv([lambda: gym.make(env_id, **options) for _ in range(n_envs)])

@@ -33,12 +33,20 @@ def check_sizes(config: RunConfig) -> None:
     """Raise a ValueError for a new run's settings that are fine alone but not together."""
     horizon = IDS[config.env_id][0].horizon if config.env_id in IDS else None
     check_stages(config.env_id, config.settings, horizon)
-    settings = {**_defaults(StageSettings), **config.settings}
-    _check_learning(settings["algorithm"], "", "n_timesteps", config.total_timesteps)
-    if _has_object_stage(settings):
-        steps = settings["object_timesteps"]
-        where = "object_algorithm: "
-        _check_learning(settings["object_algorithm"], where, "object_timesteps", steps)
+
+
+def idle_robot(config: RunConfig) -> str:
+    """Return a sentence about a run too short for its robot to learn, "" otherwise.
+
+    Such a run is a try of all its parts, with the settings of a long one.
+    """
+    starts = (config.settings.get("algorithm") or {}).get("learning_starts", 0)
+    if starts < config.total_timesteps:
+        return ""
+    return (
+        f"learning_starts is {starts} and n_timesteps {config.total_timesteps}: the robot will act "
+        "at random and learn nothing"
+    )
 
 
 def check_stages(env_id: str, given: Mapping[str, Any], horizon: int | None) -> None:
@@ -56,7 +64,7 @@ def check_stages(env_id: str, given: Mapping[str, Any], horizon: int | None) -> 
     if _has_object_stage(settings):
         where, n_envs = "object_algorithm: ", settings["object_n_envs"]
         _check_algorithm(settings["object_algorithm"], n_envs, horizon, whole, where)
-        _check_object_networks(settings["object_algorithm"])
+        _check_object(settings["object_algorithm"] or {}, settings["object_timesteps"])
     if settings["imagine"]:
         curriculum = {**_defaults(CurriculumSettings), **(settings["curriculum"] or {})}
         levels = horizon if curriculum["levels"] == "time" else curriculum["n_levels"]
@@ -90,18 +98,15 @@ def _check_algorithm(
         )
 
 
-def _check_learning(given: Mapping[str, Any] | None, where: str, name: str, total: int) -> None:
-    starts = (given or {}).get("learning_starts", AlgorithmSettings.learning_starts)
+def _check_object(given: Mapping[str, Any], total: int) -> None:
+    """Raise a ValueError for an object that never learns, or whose networks no file can hold."""
+    starts = given.get("learning_starts", AlgorithmSettings.learning_starts)
     if starts >= total:
         raise ValueError(
-            f"{where}learning_starts is {starts}; it must be less than {name}, {total}, or nothing "
-            "is learned"
+            f"object_algorithm: learning_starts is {starts}; it must be less than "
+            f"object_timesteps, {total}, or nothing is learned"
         )
-
-
-def _check_object_networks(given: Mapping[str, Any] | None) -> None:
-    """Raise a ValueError for networks that the files of SLDR's reward cannot hold."""
-    net_arch = ((given or {}).get("policy_kwargs") or {}).get("net_arch")
+    net_arch = (given.get("policy_kwargs") or {}).get("net_arch")
     for widths in net_arch.values() if isinstance(net_arch, dict) else [net_arch]:
         if widths == []:
             raise ValueError(

@@ -222,7 +222,6 @@ def test_configurations_of_earlier_runs_load_as_they_are(folder: Path) -> None:
             {"train_freq": 10, "learning_starts": 20},
             "learning_starts is 20; with train_freq 10 and 2 environments it must be at least 100",
         ),
-        ({"learning_starts": 3600}, "learning_starts is 3600; it must be less than n_timesteps"),
     ],
 )
 def test_sizes_that_do_not_fit_together_are_told_before_anything_runs(
@@ -267,6 +266,16 @@ def test_the_smallest_sizes_that_can_be_meant_are_taken() -> None:
     make_model(buffer_size=8, learning_starts=10**9)
     starts = {"train_freq": 10, "learning_starts": 800}
     assert run_config(TASK, overrides=starts).settings["algorithm"]["learning_starts"] == 800
+
+
+def test_a_run_too_short_for_its_robot_to_learn_says_so_once(tmp_path: Path) -> None:
+    said: list[str] = []
+    algorithm = {**TINY["algorithm"], "learning_starts": 200}
+    settings = {**TINY, "imagine": False, "algorithm": algorithm}
+    config = RunConfig(TASK, "her", total_timesteps=200, n_final_episodes=1, settings=settings)
+    train(config, tmp_path / "run", report=said.append)
+    sentence = "learning_starts is 200 and n_timesteps 200: the robot will act at random"
+    assert sum(each.startswith(sentence) for each in said) == 1
 
 
 def test_a_reward_has_its_own_settings_alone() -> None:
