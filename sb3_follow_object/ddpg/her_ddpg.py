@@ -10,6 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
@@ -236,6 +237,11 @@ class HerDDPG(DDPG):
         ):
             steps = self.train_freq.frequency * self._horizon()
             self.train_freq = TrainFreq(steps, TrainFrequencyUnit.STEP)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
+            self.replay_buffer.check_size()  # before the first step rather than after it
+        return super()._setup_learn(*args, **kwargs)
 
     def _horizon(self) -> int:
         """Steps of an episode, from the environment's spec."""

@@ -63,8 +63,8 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
     The other arguments are HerReplayBuffer's.
 
     Raises:
-        ValueError: an argument is outside its range, an episode is longer than the buffer, or
-            imagined goals are asked for without the wrapper that imagines them.
+        ValueError: an argument is outside its range, imagined goals are asked for without the
+            wrapper that imagines them, or, at the first step, an episode does not fit.
     """
 
     def __init__(
@@ -106,9 +106,6 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         )
         n_envs = checked_whole("n_envs", n_envs, 1)
         buffer_size = checked_whole("buffer_size", buffer_size, 1)
-        horizon = _horizon(env)
-        if horizon is not None:
-            check_buffer(buffer_size, n_envs, horizon)
         super().__init__(
             buffer_size,
             observation_space,
@@ -169,6 +166,8 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         Raises:
             ValueError: an environment returned NaN or infinity; nothing of the step is stored.
         """
+        if self.n_added == 0:
+            self.check_size()
         check_finite(obs, next_obs, action, reward)
         pos = self.pos
         rows = [
@@ -274,6 +273,17 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         if self.min_goal_distance > 0.0:
             stores["far"] = self._far
         return stores
+
+    def check_size(self) -> None:
+        """Raise a ValueError where the buffer cannot hold an episode of every environment.
+
+        Not done as it is made: what is loaded only to act may have next to none.
+        """
+        if self.env is None or not self.env.has_attr("spec"):
+            return
+        spec = self.env.get_attr("spec", indices=[0])[0]
+        if spec is not None and spec.max_episode_steps is not None:
+            check_buffer(self.buffer_size, self.n_envs, spec.max_episode_steps)
 
     def check_ready(self) -> None:
         """Raise RuntimeError while there is nothing to draw from."""
@@ -434,11 +444,3 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         if self.env is None:
             raise RuntimeError("the replay buffer has no environment: call set_env() after loading")
         return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
-
-
-def _horizon(env: VecEnv | None) -> int | None:
-    """Steps of an episode at most, from the environment's spec; None where that does not say."""
-    if env is None or not env.has_attr("spec"):
-        return None
-    spec = env.get_attr("spec", indices=[0])[0]
-    return None if spec is None else spec.max_episode_steps

@@ -13,19 +13,19 @@ from .run_config import RunConfig
 from .stages import CurriculumSettings, StageSettings
 
 
-def check_buffer(buffer_size: int, n_envs: int, horizon: int, where: str = "") -> None:
+def check_buffer(slots: int, n_envs: int, horizon: int, where: str = "") -> None:
     """Raise a ValueError unless a replay buffer holds an episode of every environment.
 
     Args:
-        buffer_size: transitions of all environments, as SB3 counts them.
+        slots: steps of each environment that it holds, buffer_size // n_envs.
         n_envs: environments.
         horizon: T, steps of an episode.
         where: beginning of the sentence.
     """
-    if buffer_size // n_envs < horizon:
+    if slots < horizon:
         raise ValueError(
-            f"{where}buffer_size is {buffer_size}; it must be at least {n_envs * horizon}, an "
-            f"episode of {horizon} steps in each of {n_envs} environments"
+            f"{where}buffer_size leaves {slots} steps for each of {n_envs} environments, fewer "
+            f"than the {horizon} of an episode; it must be at least {n_envs * horizon}"
         )
 
 
@@ -85,7 +85,7 @@ def _check_algorithm(
         raise ValueError(f"{where}batch_size is {batch}; it must be at most buffer_size, {size}")
     if horizon is None:
         return
-    check_buffer(size, n_envs, horizon, where)
+    check_buffer(size // n_envs, n_envs, horizon, where)
     frequency = settings["train_freq"]
     steps, unit = frequency if isinstance(frequency, tuple) else (frequency, "step")
     # SB3 learns after the first rollout that brings it beyond learning_starts.

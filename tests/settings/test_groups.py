@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from small_buffers import make_buffer, make_env
 from small_models import make_model
+from stable_baselines3 import DDPG
 from tiny_runs import TINY
 from toy import HORIZON
 
@@ -215,8 +216,11 @@ def test_configurations_of_earlier_runs_load_as_they_are(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"buffer_size": 60, "batch_size": 16}, "buffer_size is 60; it must be at least 100, an"),
-        ({"buffer_size": 99, "batch_size": 16}, "episode of 50 steps in each of 2 environments"),
+        ({"buffer_size": 60, "batch_size": 16}, "buffer_size leaves 30 steps for each of 2"),
+        (
+            {"buffer_size": 99, "batch_size": 16},
+            "than the 50 of an episode; it must be at least 100",
+        ),
         ({"batch_size": 2001}, "batch_size is 2001; it must be at most buffer_size, 2000"),
         (
             {"train_freq": 10, "learning_starts": 20},
@@ -237,7 +241,10 @@ def test_sizes_that_do_not_fit_together_are_told_before_anything_runs(
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"object_algorithm": {"buffer_size": 700}}, "object_algorithm: buffer_size is 700"),
+        (
+            {"object_algorithm": {"buffer_size": 700}},
+            "object_algorithm: buffer_size leaves 43 steps",
+        ),
         ({"object_algorithm": {"batch_size": 900, "buffer_size": 800}}, "at most buffer_size, 800"),
         ({"object_timesteps": 500, "object_algorithm": {"learning_starts": 500}}, "nothing is le"),
         ({"curriculum": {"k_max": 26, "levels": "path"}}, "k_max is 26; it must be at most 25"),
@@ -257,8 +264,14 @@ def test_sizes_of_the_other_stages_have_to_fit_too(
 def test_the_smallest_sizes_that_can_be_meant_are_taken() -> None:
     env = make_vec(TASK, 2, 1)
     tiny: dict[str, Any] = {"batch_size": 4, "policy_kwargs": {"net_arch": [8]}, "seed": 0}
-    with pytest.raises(ValueError, match="buffer_size is 99; it must be at least 100"):
-        HerDDPG("MultiInputPolicy", env, buffer_size=99, **tiny)
+    small = HerDDPG("MultiInputPolicy", env, buffer_size=99, **tiny)  # it can act, not learn
+    with pytest.raises(ValueError, match=r"buffer_size leaves 49 .*; it must be at least 100"):
+        small.learn(100)
+    stock = DDPG(
+        "MultiInputPolicy", env, buffer_size=60, replay_buffer_class=FollowObjectReplayBuffer
+    )
+    with pytest.raises(ValueError, match=r"buffer_size leaves 30 .*; it must be at least 100"):
+        stock.learn(100)
     HerDDPG("MultiInputPolicy", env, buffer_size=100, gradient_steps=-1, **tiny).learn(100)
     env.close()
     # An environment that does not say how long its episodes are is believed.
