@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from ..common.numbers import checked_whole
 from .scene import N_SUBSTEPS, OBJECT, TUBE, Scene, weld_targets
 
 _LOGGER = logging.getLogger("sb3_follow_object")
@@ -45,13 +46,11 @@ class BatchedSimulation:
     observation_size: int
 
     def __init__(self, scene: Scene, n_envs: int, n_threads: int | None = None) -> None:
-        if n_envs < 1:
-            raise ValueError(f"n_envs must be at least 1, not {n_envs}.")
-        if n_threads is not None and n_threads < 1:
-            raise ValueError(f"n_threads must be at least 1 or None, not {n_threads}.")
+        n_envs = checked_whole("n_envs", n_envs, 1)
+        n_threads = cores() if n_threads is None else checked_whole("n_threads", n_threads, 1)
         self.scene = scene
         self.n_envs = n_envs
-        self.n_threads = min(n_threads or cores(), n_envs)
+        self.n_threads = min(n_threads, n_envs)
         self._pool = ThreadPoolExecutor(self.n_threads - 1) if self.n_threads > 1 else None
         model = scene.model
         self.dt = model.opt.timestep * N_SUBSTEPS

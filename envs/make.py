@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from ..common.numbers import checked_whole
 from ..common.suggestions import did_you_mean
 from .fetch import FetchVecEnv
 from .object_locomotion import ObjectVecEnv
@@ -26,7 +27,7 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
         options: keywords of `FetchVecEnv`, `ObjectVecEnv` or `gymnasium.make`; `seed` for all.
 
     Raises:
-        ValueError: the id is unknown, an option is wrong or `n_envs` is below 1.
+        ValueError: the id is unknown, an option is wrong or a count is below 1.
     """
     name = import_task(env_id)
     if name in IDS:
@@ -37,8 +38,7 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
             raise ValueError(f"{env_id!r} cannot be made: {error}") from error
         return face(name, n_envs, n_threads, **options)
 
-    if n_envs < 1:
-        raise ValueError(f"n_envs must be at least 1, not {n_envs}.")
+    n_envs = checked_whole("n_envs", n_envs, 1)
     seed = options.pop("seed", None)
     try:
         venv = DummyVecEnv([lambda: gym.make(env_id, **options) for _ in range(n_envs)])

@@ -8,6 +8,8 @@ from typing import Literal
 
 import numpy as np
 
+from ..common.numbers import checked_whole
+
 SUCCESS_DISTANCE = 0.05
 # An object this near to the start region's reference point, seen from above, is drawn again.
 MIN_START_DISTANCE = 0.10
@@ -123,10 +125,8 @@ class Task:
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*", self.name):
             raise ValueError(f"A task's name is made of letters and digits, not {self.name!r}.")
-        if type(self.horizon) is not int or self.horizon < 1:
-            raise ValueError(
-                f"The horizon of {self.name} is {self.horizon!r}; it must be a whole number >= 1."
-            )
+        horizon = checked_whole(f"the horizon of {self.name}", self.horizon, 1)
+        object.__setattr__(self, "horizon", horizon)
         try:
             hash(self)  # scenes are kept by their tasks
         except TypeError as error:

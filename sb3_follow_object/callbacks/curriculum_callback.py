@@ -14,7 +14,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from ..envs import IDS, make_vec
 from ..imagination.curriculum import Curriculum
 from ..imagination.vec_env import ImaginedGoalVecEnv, imagination_of
-from ..settings.ranges import check_positive
+from ..settings.stages import CurriculumTestSettings
 from .rollout import Observation, OnStep, noise_free, run_episodes
 
 
@@ -50,20 +50,20 @@ class CurriculumCallback(BaseCallback):
     def __init__(
         self,
         test_env: ImaginedGoalVecEnv | None = None,
-        n_episodes: int | None = None,
-        every: int = 1,
-        store: bool = True,
+        n_episodes: int | None = CurriculumTestSettings.n_episodes,
+        every: int = CurriculumTestSettings.every,
+        store: bool = CurriculumTestSettings.store,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
         is_test = isinstance(test_env, ImaginedGoalVecEnv) and test_env.mode == "test"
         if test_env is not None and not is_test:
             raise ValueError("test_env must be an ImaginedGoalVecEnv with mode='test'.")
-        check_positive(n_episodes=1 if n_episodes is None else n_episodes, every=every)
+        settings = CurriculumTestSettings(n_episodes=n_episodes, every=every, store=store)
         self._test_env = test_env
-        self.n_episodes = n_episodes
-        self.every = every
-        self.store = store
+        self.n_episodes = settings.n_episodes
+        self.every = settings.every
+        self.store = settings.store
         self.test_steps = 0
         self._cycles = 0
         self._episode_ended = False

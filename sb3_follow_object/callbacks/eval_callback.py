@@ -13,8 +13,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped
 
 from ..common.files import atomic_write
+from ..common.numbers import checked_number, checked_whole
 from ..common.seeds import stream_seed
-from ..settings.ranges import check_positive
 from .curriculum_callback import CurriculumCallback
 from .rollout import noise_free, run_episodes
 
@@ -72,26 +72,23 @@ class OriginalGoalEvalCallback(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        check_positive(n_episodes=n_episodes, every_steps=every_steps)
-        if object_steps < 0:
-            raise ValueError(f"object_steps must be >= 0, got {object_steps!r}.")
         if is_vecenv_wrapped(eval_env, VecNormalize):
             raise ValueError(
                 "eval_env is in VecNormalize; the model's own normalises already: leave it out."
             )
         self.eval_env = eval_env
-        self.n_episodes = n_episodes
-        self.every_steps = every_steps
+        self.n_episodes = checked_whole("n_episodes", n_episodes, 1)
+        self.every_steps = checked_whole("every_steps", every_steps, 1)
         self.csv_path = None if csv_path is None else Path(csv_path)
         self.curriculum_callback = curriculum_callback
-        self.object_steps = object_steps
+        self.object_steps = checked_whole("object_steps", object_steps, 0)
         self.success_rate: float | None = None
         self._rows: list[dict[str, Any]] = []
         self._last_steps = 0
         self.n_evaluations = 0
-        self.seed = seed
+        self.seed = None if seed is None else checked_whole("seed", seed, 0)
         self._resumed = False
-        self._wall_before = wall_before
+        self._wall_before = checked_number("wall_before", wall_before)
         self._started = time.monotonic()
 
     @property

@@ -10,6 +10,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..common.numbers import checked_whole
 from ..ddpg.her_ddpg import HerDDPG
 
 Observation = dict[str, np.ndarray]
@@ -77,8 +78,7 @@ def run_episodes(
         ValueError: if `n_episodes` is below 1 or an episode ends without saying `is_success`.
         RuntimeError: more than `n_episodes` episodes diverged.
     """
-    if n_episodes < 1:
-        raise ValueError(f"n_episodes is {n_episodes}; it must be at least 1")
+    n_episodes = checked_whole("n_episodes", n_episodes, 1)
     n_envs = venv.num_envs
     wanted = np.array([(n_episodes + i) // n_envs for i in range(n_envs)])
     finished = np.zeros(n_envs, dtype=int)

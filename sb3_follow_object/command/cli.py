@@ -1,4 +1,4 @@
-"""The command `sb3-follow-object`: train, evaluate, watch, plot, compare, predictor."""
+"""The command `sb3-follow-object`: train, evaluate, watch, plot, compare, predictor, settings."""
 
 from __future__ import annotations
 
@@ -283,6 +283,12 @@ def _predictor(args: argparse.Namespace) -> None:
     print(args.out)
 
 
+def _settings(args: argparse.Namespace) -> None:
+    from ..settings.table import lines
+
+    print(*lines(args.name), sep="\n")
+
+
 def _print_table(row: dict[str, Any]) -> None:
     """Print one result."""
     from rich.console import Console
@@ -308,4 +314,5 @@ _COMMANDS = {
     "plot": _plot,
     "compare": _compare,
     "predictor": _predictor,
+    "settings": _settings,
 }

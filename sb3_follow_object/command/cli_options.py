@@ -66,6 +66,11 @@ def make_parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
     predictor.set_defaults(method="fo")
     predictor.add_argument("--out", type=Path, required=True, metavar="FOLDER")
     _add_settings(predictor)
+
+    settings = subparsers.add_parser("settings", help="list what --set can change")
+    settings.add_argument(
+        "name", nargs="?", metavar="NAME", help="one of them, or a group, e.g. curriculum"
+    )
     for name, subparser in subparsers.choices.items():
         subparser.set_defaults(run_command=commands[name])
     return parser
@@ -173,5 +178,6 @@ def _add_set(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="KEY.SUB=VALUE",
-        help="change one setting, e.g. curriculum.p=0.5; may be repeated",
+        help="change one setting, e.g. curriculum.p=0.5; may be repeated; "
+        f"`{PROGRAM} settings` lists them",
     )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .numbers import checked_whole
+
 
 def stream_seed(seed: int, purpose: str) -> int:
     """Return the seed of one random stream of a run, below 2**31 - 1000.
@@ -13,9 +15,7 @@ def stream_seed(seed: int, purpose: str) -> int:
         purpose: any name; different names give unrelated streams.
 
     Raises:
-        ValueError: the seed is negative.
+        ValueError: the seed is negative or no whole number.
     """
-    if seed < 0:
-        raise ValueError(f"seed is {seed}; it must be at least 0")
-    words = [seed, *purpose.encode()]
+    words = [checked_whole("seed", seed, 0), *purpose.encode()]
     return int(np.random.SeedSequence(words).generate_state(1)[0]) % (2**31 - 1000)

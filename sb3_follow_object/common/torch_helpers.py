@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch as th
+from stable_baselines3.common.utils import get_device
 
 
 @contextmanager
@@ -33,3 +35,16 @@ def threads_at(n: int | None) -> Iterator[None]:
 def lowest(q_values: list[th.Tensor]) -> th.Tensor:
     """Elementwise minimum over critics (n, 1)."""
     return q_values[0] if len(q_values) == 1 else th.stack(q_values).amin(dim=0)
+
+
+def usable_device(name: Any) -> th.device:
+    """Return PyTorch's device of this name; "auto" is a GPU where there is one.
+
+    Raises:
+        ValueError: there is none of that name here.
+    """
+    try:
+        return get_device(name)
+    except (RuntimeError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device {name!r} cannot be used: {reason}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -10,13 +11,13 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from ..common.providers import provided, provider
-from ..common.suggestions import did_you_mean
+from ..common.providers import provider
 from ..common.torch_helpers import lowest, matmul_at
-from ..settings.keywords import check_keywords
+from ..settings.fields import check_names
+from ..settings.learning import AUXILIARY as KIND
+from ..settings.learning import AuxiliarySettings, check_auxiliary
 from .policies import HerPolicy
 
-KIND = "auxiliary reward"  # as `providers` knows them
 _COMMON = ("name", "weight")
 _GIVEN = ("n_features",)  # what the algorithm, not the user, tells a reward
 
@@ -109,11 +110,10 @@ class AuxiliaryCritic(nn.Module):
         policy: HerPolicy,
         learning_rate: float,
         gamma: float,
-        weight: float = 1.0,
+        weight: float = AuxiliarySettings.weight,
     ) -> None:
         super().__init__()
-        if weight < 0.0:
-            raise ValueError(f"auxiliary: weight is {weight}; it must be >= 0")
+        weight = AuxiliarySettings(weight=weight).weight
         self.reward = reward
         self.gamma = gamma
         self.weight = weight
@@ -193,22 +193,7 @@ class AuxiliaryCritic(nn.Module):
             optimizer.load_state_dict(state["optimizers"][name])
 
 
-def reward_class(name: Any) -> type[AuxiliaryReward]:
-    """Return the class of an auxiliary reward, given its name or itself.
-
-    Raises:
-        ValueError: there is none of that name.
-    """
-    if isinstance(name, type) and issubclass(name, AuxiliaryReward):
-        return name
-    known = provided(KIND)
-    if not isinstance(name, str) or name not in known:
-        raise ValueError(f"auxiliary has no reward {name!r}{did_you_mean(str(name), known)}")
-    chosen: type[AuxiliaryReward] = provider(KIND, name)
-    return chosen
-
-
-def check_auxiliary(settings: Mapping[str, Any]) -> type[AuxiliaryReward]:
+def reward_class(settings: Mapping[str, Any]) -> type[AuxiliaryReward]:
     """Return the class that settings name.
 
     Args:
@@ -217,18 +202,21 @@ def check_auxiliary(settings: Mapping[str, Any]) -> type[AuxiliaryReward]:
     Raises:
         ValueError: an unknown name or setting, with the nearest that exists.
     """
-    if not isinstance(settings, Mapping) or "name" not in settings:
-        raise ValueError(
-            f"auxiliary is {settings!r}; give a mapping with a name, e.g. {{name: rnd}}"
-        )
-    chosen = reward_class(settings["name"])
-    check_keywords(f"auxiliary ({chosen.name})", _options(settings), chosen.__init__, hidden=_GIVEN)
-    return chosen
+    check_auxiliary(settings)
+    name = settings["name"]
+    if not isinstance(name, type):
+        chosen: type[AuxiliaryReward] = provider(KIND, name)
+        return chosen
+    if not issubclass(name, AuxiliaryReward):
+        raise ValueError(f"auxiliary: {name.__name__} is no subclass of AuxiliaryReward")
+    known = sorted({*inspect.signature(name.__init__).parameters} - {"self", *_GIVEN})
+    check_names(_options(settings), known, f"auxiliary ({name.name})")
+    return name
 
 
 def resolve_auxiliary(settings: Mapping[str, Any], env: VecEnv | None) -> dict[str, Any]:
     """Check settings and resolve what they refer to; see `AuxiliaryReward.resolve`."""
-    chosen = check_auxiliary(settings)
+    chosen = reward_class(settings)
     return {**_common(settings), **chosen.resolve(_options(settings), env)}
 
 
@@ -236,9 +224,9 @@ def make_auxiliary(
     settings: Mapping[str, Any], policy: HerPolicy, learning_rate: float, gamma: float
 ) -> AuxiliaryCritic:
     """Build the reward that resolved settings name, with its critic."""
-    chosen = reward_class(settings["name"])
+    chosen = reward_class(settings)
     reward = chosen(n_features=policy.actor.features_dim, **_options(settings))
-    weight = float(settings.get("weight", 1.0))
+    weight = settings.get("weight", AuxiliarySettings.weight)
     return AuxiliaryCritic(reward, policy, learning_rate, gamma, weight)
 
 

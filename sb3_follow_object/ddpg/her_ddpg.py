@@ -10,6 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
@@ -21,10 +22,11 @@ from stable_baselines3.common.type_aliases import (
 )
 from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped
 
+from ..common.numbers import checked_whole
 from ..common.torch_helpers import matmul_at, threads_at
 from ..replay.device_replay import device_replay_of
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
-from ..settings.ranges import check_positive, check_value
+from ..settings.learning import AlgorithmSettings
 from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
 from .input_moments import InputMoments
 from .policies import HerPolicy
@@ -36,7 +38,6 @@ SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 _SAMPLE_CHUNK = 32_768
 # The same on the learner's device, where memory is plenty and a chunk is a graph.
 _DEVICE_CHUNK = 262_144
-_PRECISIONS = ("highest", "high", "medium")
 
 
 class HerDDPG(DDPG):
@@ -104,90 +105,103 @@ class HerDDPG(DDPG):
         self,
         policy: str | type[HerPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
-        buffer_size: int = 1_000_000,
-        learning_starts: int = 0,
-        batch_size: int = 512,
-        tau: float = 0.01,
-        gamma: float | None = None,
-        train_freq: int | tuple[int, str] = (1, "episode"),
-        gradient_steps: int = 40,
+        learning_rate: float | Schedule = AlgorithmSettings.learning_rate,
+        buffer_size: int = AlgorithmSettings.buffer_size,
+        learning_starts: int = AlgorithmSettings.learning_starts,
+        batch_size: int = AlgorithmSettings.batch_size,
+        tau: float = AlgorithmSettings.tau,
+        gamma: float | None = AlgorithmSettings.gamma,
+        train_freq: int | tuple[int, str] = AlgorithmSettings.train_freq,
+        gradient_steps: int = AlgorithmSettings.gradient_steps,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        noise_std: float = 0.2,
-        random_action_prob: float = 0.3,
-        action_l2: float = 1.0,
-        target_clip: tuple[float, float] | str | None = "auto",
-        hindsight_bound: bool = False,
-        target_update_interval: int = 1,
-        average_decay: float = 0.0,
-        matmul_precision: str = "highest",
-        auxiliary: dict[str, Any] | None = None,
-        update_threads: int | None = None,
-        replay_on_device: bool | None = None,
-        tensorboard_log: str | None = None,
+        optimize_memory_usage: bool = AlgorithmSettings.optimize_memory_usage,
+        noise_std: float = AlgorithmSettings.noise_std,
+        random_action_prob: float = AlgorithmSettings.random_action_prob,
+        action_l2: float = AlgorithmSettings.action_l2,
+        target_clip: tuple[float, float] | str | None = AlgorithmSettings.target_clip,
+        hindsight_bound: bool = AlgorithmSettings.hindsight_bound,
+        target_update_interval: int = AlgorithmSettings.target_update_interval,
+        average_decay: float = AlgorithmSettings.average_decay,
+        matmul_precision: str = AlgorithmSettings.matmul_precision,
+        auxiliary: dict[str, Any] | None = AlgorithmSettings.auxiliary,
+        update_threads: int | None = AlgorithmSettings.update_threads,
+        replay_on_device: bool | None = AlgorithmSettings.replay_on_device,
+        tensorboard_log: str | None = AlgorithmSettings.tensorboard_log,
         policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
+        verbose: int = AlgorithmSettings.verbose,
         seed: int | None = None,
-        device: th.device | str = "auto",
+        device: th.device | str = AlgorithmSettings.device,
         _init_setup_model: bool = True,
     ):
-        if not 0.0 <= random_action_prob <= 1.0:
-            raise ValueError(f"random_action_prob is {random_action_prob}; it must lie in [0, 1]")
-        if noise_std < 0.0 or action_l2 < 0.0:
-            raise ValueError(f"noise_std ({noise_std}) and action_l2 ({action_l2}) must be >= 0")
-        if not (target_clip is None or target_clip == "auto" or _is_interval(target_clip)):
-            raise ValueError(f'target_clip is {target_clip!r}; give (low, high), "auto" or None')
-        check_positive(target_update_interval=target_update_interval)
-        if not 0.0 <= average_decay < 1.0:
-            raise ValueError(f"average_decay is {average_decay}; it must lie in [0, 1)")
-        if matmul_precision not in _PRECISIONS:
-            raise ValueError(
-                f"matmul_precision is {matmul_precision!r}; {', '.join(_PRECISIONS)} exist"
-            )
-        if update_threads is not None:
-            check_positive(update_threads=update_threads)
-        if replay_on_device not in (None, False, True):
-            raise ValueError(f"replay_on_device is {replay_on_device!r}; give true, false or none")
-        for name, value in (("gamma", gamma), ("tau", tau), ("batch_size", batch_size)):
-            if value is not None:
-                check_value(name, value, "HerDDPG")
-        super().__init__(
-            policy,
-            env,
+        own_policy = policy in ("MultiInputPolicy", HerPolicy)
+        own_buffer = replay_buffer_class in (None, FollowObjectReplayBuffer)
+        settings = AlgorithmSettings(
+            policy=policy,
             learning_rate=learning_rate,
             buffer_size=buffer_size,
             learning_starts=learning_starts,
             batch_size=batch_size,
             tau=tau,
-            gamma=gamma,  # type: ignore[arg-type]  # resolved in _setup_model
+            gamma=gamma,
             train_freq=train_freq,
             gradient_steps=gradient_steps,
+            optimize_memory_usage=optimize_memory_usage,
+            noise_std=noise_std,
+            random_action_prob=random_action_prob,
+            action_l2=action_l2,
+            target_clip=target_clip,
+            hindsight_bound=hindsight_bound,
+            target_update_interval=target_update_interval,
+            average_decay=average_decay,
+            matmul_precision=matmul_precision,  # type: ignore[arg-type]  # checked there
+            auxiliary=auxiliary,
+            update_threads=update_threads,
+            replay_on_device=replay_on_device,
+            # Classes of others have keywords of their own.
+            replay_buffer_kwargs=replay_buffer_kwargs if own_buffer else None,
+            policy_kwargs=policy_kwargs if own_policy else None,
+            verbose=verbose,
+            tensorboard_log=tensorboard_log,
+        )
+        super().__init__(
+            policy,
+            env,
+            learning_rate=settings.learning_rate,
+            buffer_size=settings.buffer_size,
+            learning_starts=settings.learning_starts,
+            batch_size=settings.batch_size,
+            tau=settings.tau,
+            gamma=settings.gamma,  # type: ignore[arg-type]  # resolved in _setup_model
+            train_freq=settings.train_freq,
+            gradient_steps=settings.gradient_steps,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class or FollowObjectReplayBuffer,
-            replay_buffer_kwargs=replay_buffer_kwargs,
-            optimize_memory_usage=optimize_memory_usage,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=dict(policy_kwargs or {}),  # DDPG writes into it
-            verbose=verbose,
-            seed=seed,
+            replay_buffer_kwargs=(
+                settings.replay_buffer_kwargs if own_buffer else replay_buffer_kwargs
+            ),
+            optimize_memory_usage=settings.optimize_memory_usage,
+            tensorboard_log=settings.tensorboard_log,
+            # DDPG writes into it
+            policy_kwargs=dict((settings.policy_kwargs if own_policy else policy_kwargs) or {}),
+            verbose=settings.verbose,
+            seed=None if seed is None else checked_whole("seed", seed, 0),
             device=device,
             _init_setup_model=False,
         )
-        self.noise_std = noise_std
-        self.random_action_prob = random_action_prob
-        self.action_l2 = action_l2
-        self.target_clip = target_clip
-        self.hindsight_bound = hindsight_bound
-        self.target_update_interval = target_update_interval
-        self.average_decay = average_decay
-        self.matmul_precision = matmul_precision
-        self.update_threads = update_threads
-        self.auxiliary = auxiliary
+        self.noise_std = settings.noise_std
+        self.random_action_prob = settings.random_action_prob
+        self.action_l2 = settings.action_l2
+        self.target_clip = settings.target_clip
+        self.hindsight_bound = settings.hindsight_bound
+        self.target_update_interval = settings.target_update_interval
+        self.average_decay = settings.average_decay
+        self.matmul_precision: str = settings.matmul_precision
+        self.update_threads = settings.update_threads
+        self.auxiliary = settings.auxiliary
         self.auxiliary_critic: AuxiliaryCritic | None = None
-        self.replay_on_device = replay_on_device
+        self.replay_on_device = settings.replay_on_device
         if _init_setup_model:
             self._setup_model()
 
@@ -230,6 +244,11 @@ class HerDDPG(DDPG):
         ):
             steps = self.train_freq.frequency * self._horizon()
             self.train_freq = TrainFreq(steps, TrainFrequencyUnit.STEP)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
+            self.replay_buffer.check_size()  # before the first step rather than after it
+        return super()._setup_learn(*args, **kwargs)
 
     def _horizon(self) -> int:
         """Steps of an episode, from the environment's spec."""
@@ -447,10 +466,3 @@ class HerDDPG(DDPG):
             live += self.auxiliary_critic.q_networks.parameters()
             target += self.auxiliary_critic.target_networks.parameters()
         return live, target
-
-
-def _is_interval(value: Any) -> bool:
-    """Whether a value is a pair of numbers in order."""
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        return False
-    return all(isinstance(limit, int | float) for limit in value) and value[0] <= value[1]

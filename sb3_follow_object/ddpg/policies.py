@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
+from ..settings.learning import PolicySettings
 from .layer_norm import LayerNorm
 
 
@@ -31,7 +32,7 @@ class NormalizedGoalExtractor(BaseFeaturesExtractor):
     mean: th.Tensor
     std: th.Tensor
 
-    def __init__(self, observation_space: spaces.Dict, clip: float = 5.0):
+    def __init__(self, observation_space: spaces.Dict, clip: float = PolicySettings.features_clip):
         self.keys = ("observation", "desired_goal")
         dim = sum(get_flattened_obs_dim(observation_space[key]) for key in self.keys)
         super().__init__(observation_space, dim)
@@ -80,8 +81,8 @@ class HerPolicy(TD3Policy):
         action_space: spaces.Box,
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
-        critic_layer_norm: bool = False,
-        features_clip: float = 5.0,
+        critic_layer_norm: bool = PolicySettings.critic_layer_norm,
+        features_clip: float = PolicySettings.features_clip,
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):

@@ -9,6 +9,7 @@ import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
+from ..settings.learning import RndSettings
 from .auxiliary import AuxiliaryReward, Transitions
 
 
@@ -40,31 +41,26 @@ class RndReward(AuxiliaryReward):
     def __init__(
         self,
         n_features: int,
-        hidden: Sequence[int] = (256, 256, 256),
-        n_outputs: int = 256,
-        learning_rate: float = 1e-3,
-        max_bonus: float = 5.0,
+        hidden: Sequence[int] = RndSettings.hidden,
+        n_outputs: int = RndSettings.n_outputs,
+        learning_rate: float = RndSettings.learning_rate,
+        max_bonus: float = RndSettings.max_bonus,
     ) -> None:
         super().__init__()
-        if not hidden or min(*hidden, n_outputs) < 1:
-            raise ValueError(
-                f"auxiliary (rnd): hidden ({hidden}) and n_outputs ({n_outputs}) must be >= 1"
-            )
-        if learning_rate <= 0.0 or max_bonus <= 0.0:
-            raise ValueError(
-                f"auxiliary (rnd): learning_rate ({learning_rate}) and max_bonus ({max_bonus}) "
-                "must be > 0"
-            )
-        self.reward_range = (0.0, max_bonus)
+        settings = RndSettings(
+            hidden=hidden, n_outputs=n_outputs, learning_rate=learning_rate, max_bonus=max_bonus
+        )
+        self.reward_range = (0.0, settings.max_bonus)
         self.target, self.predictor = (
-            nn.Sequential(*create_mlp(n_features, n_outputs, list(hidden))) for _ in range(2)
+            nn.Sequential(*create_mlp(n_features, settings.n_outputs, settings.hidden))
+            for _ in range(2)
         )
         for network in (self.target, self.predictor):
             _initialise(network)
         self.target.requires_grad_(False)
         for name, value in (("mean", 0.0), ("var", 0.0), ("count", 0.0)):
             self.register_buffer(name, th.tensor(value, dtype=th.float64))
-        self.optimizer = th.optim.Adam(self.predictor.parameters(), lr=learning_rate)
+        self.optimizer = th.optim.Adam(self.predictor.parameters(), lr=settings.learning_rate)
 
     def errors(self, batch: Transitions) -> th.Tensor:
         """Squared prediction error of each transition, summed over the outputs, (n, 1)."""

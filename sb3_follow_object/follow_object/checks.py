@@ -8,67 +8,46 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..common.torch_helpers import usable_device
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs import make_vec, object_id
-from ..imagination.curriculum import Curriculum
-from ..imagination.goal_predictor import GoalPredictor
-from ..object_stage.networks import ObjectNetworks
-from ..settings.keywords import check_keywords
-from ..settings.ranges import check_positive
-
-_COUNTS = ("n_envs", "object_n_envs", "object_timesteps", "test_every", "n_test_episodes")
-_OF_RUN = {"env", "seed", "_init_setup_model"}  # what the run itself gives its algorithms
+from ..settings.learning import PredictorSettings
+from ..settings.sizes import check_stages
 
 
-def check_settings(settings: Mapping[str, Any]) -> None:
-    """Raise a ValueError for a keyword that nothing takes or a number out of its range.
-
-    Args:
-        settings: `FollowObject`'s.
-    """
-    check_positive(**{name: settings[name] for name in _COUNTS})
-    if settings["n_paths"] < 2:
-        raise ValueError(f"n_paths is {settings['n_paths']}; it must be at least 2")
-    for name, function, hidden in (
-        ("algorithm", HerDDPG.__init__, _OF_RUN),
-        ("curriculum", Curriculum.__init__, {"horizon"}),
-        ("object_algorithm", HerDDPG.__init__, {*_OF_RUN, "policy"}),
-        ("predictor_fit", GoalPredictor.check_fit, ()),
-        ("inverse_fit", ObjectNetworks.check_fit, ()),
-    ):
-        check_keywords(name, settings[name], function, hidden)
-    GoalPredictor.check_fit(**settings["predictor_fit"])
-    ObjectNetworks.check_fit(**settings["inverse_fit"])
-
-
-def check_algorithms(settings: Mapping[str, Any], env: VecEnv, needs_networks: bool) -> None:
+def check_algorithms(
+    settings: Mapping[str, Any], env: VecEnv, horizon: int, needs_networks: bool
+) -> None:
     """Build a run's algorithms once, in small.
 
     Args:
         settings: `FollowObject`'s.
         env: the robot's, without imagined goals.
+        horizon: T, steps of an episode.
         needs_networks: whether SLDR's reward will read the object's networks.
 
     Raises:
         ValueError: one cannot be built.
     """
+    check_stages(settings["env_id"], settings, horizon)
+    usable_device(settings["predictor_fit"].get("device", PredictorSettings.device))
     arguments = copy.deepcopy(settings["algorithm"])  # SB3 writes into policy_kwargs
     # What these two need is not there yet; their settings have been checked.
     if needs_networks:
         del arguments["auxiliary"]
     if settings["imagine"] and arguments.get("replay_buffer_kwargs"):
         arguments["replay_buffer_kwargs"]["imagined_ratio"] = 0.0
-    _check_algorithm(env, arguments)
+    _check_algorithm(env, horizon, arguments)
     if settings["imagine"] or needs_networks:
         object_env = make_vec(object_id(settings["env_id"]), 1)
-        _check_algorithm(object_env, copy.deepcopy(settings["object_algorithm"]))
+        _check_algorithm(object_env, horizon, copy.deepcopy(settings["object_algorithm"]))
         object_env.close()
 
 
-def _check_algorithm(env: VecEnv, arguments: dict[str, Any]) -> None:
+def _check_algorithm(env: VecEnv, horizon: int, arguments: dict[str, Any]) -> None:
     if (arguments.get("replay_buffer_kwargs") or {}).get("copy_info_dict"):
         raise ValueError("copy_info_dict cannot be set: checkpoints do not hold infos")
-    small = {"policy": "MultiInputPolicy", "buffer_size": 10 * env.num_envs}
+    small = {"policy": "MultiInputPolicy", "buffer_size": horizon * env.num_envs}
     try:
         HerDDPG(env=env, **{**arguments, **small})
     except ValueError:

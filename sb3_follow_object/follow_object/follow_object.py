@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from ..callbacks.curriculum_callback import CurriculumCallback
 from ..callbacks.fresh_episodes import FreshEpisodes, begin_new_episodes
 from ..common.array_trees import load_tree, save_tree
 from ..common.files import atomic_write
+from ..common.numbers import checked_whole
 from ..common.reports import Report
 from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
 from ..common.seeds import stream_seed
@@ -32,8 +34,11 @@ from ..object_stage.networks import FILE as OBJECT_FILE
 from ..object_stage.networks import ObjectNetworks
 from ..object_stage.sldr import reads_object_networks
 from ..object_stage.stage import ObjectStage
-from ..settings.keywords import with_tuples
-from .checks import check_algorithms, check_settings
+from ..settings.fields import checked
+from ..settings.presets import run_config
+from ..settings.run_config import check_plain
+from ..settings.stages import StageSettings
+from .checks import check_algorithms
 
 
 class FollowObject:
@@ -84,53 +89,61 @@ class FollowObject:
         imagine: bool = True,
         predictor: GoalPredictor | None = None,
         object_networks: ObjectNetworks | None = None,
-        n_envs: int = 16,
-        n_threads: int | None = None,
-        reward_type: str = "sparse",
+        n_envs: int = StageSettings.n_envs,
+        n_threads: int | None = StageSettings.n_threads,
+        reward_type: str = StageSettings.reward_type,
         algorithm: dict[str, Any] | None = None,
         curriculum: dict[str, Any] | None = None,
         object_algorithm: dict[str, Any] | None = None,
-        object_on_table: bool | None = None,
-        object_n_envs: int = 16,
-        object_timesteps: int = 400_000,
-        n_paths: int = 512,
+        object_on_table: bool | None = StageSettings.object_on_table,
+        object_n_envs: int = StageSettings.object_n_envs,
+        object_timesteps: int = StageSettings.object_timesteps,
+        n_paths: int = StageSettings.n_paths,
         predictor_fit: dict[str, Any] | None = None,
         inverse_fit: dict[str, Any] | None = None,
-        test_every: int = 4,
-        n_test_episodes: int | None = None,
-        store_tests: bool = True,
+        test_every: int = StageSettings.test_every,
+        n_test_episodes: int | None = StageSettings.n_test_episodes,
+        store_tests: bool = StageSettings.store_tests,
         seed: int = 0,
         report: Report | None = None,
     ):
         full_id, env_id = env_id, known_id(env_id)
-        self.settings: dict[str, Any] = {
-            "env_id": env_id,
+        given = {
             "imagine": imagine,
             "n_envs": n_envs,
             "n_threads": n_threads,
             "reward_type": reward_type,
-            "algorithm": dict(algorithm or {}),
-            "curriculum": dict(curriculum or {}),
-            "object_algorithm": dict(object_algorithm or {}),
+            "algorithm": algorithm or {},
+            "curriculum": curriculum or {},
+            "object_algorithm": object_algorithm or {},
             "object_on_table": object_on_table,
             "object_n_envs": object_n_envs,
             "object_timesteps": object_timesteps,
             "n_paths": n_paths,
-            "predictor_fit": dict(predictor_fit or {}),
-            "inverse_fit": dict(inverse_fit or {}),
+            "predictor_fit": predictor_fit or {},
+            "inverse_fit": inverse_fit or {},
             "test_every": test_every,
             "n_test_episodes": n_envs if n_test_episodes is None else n_test_episodes,
             "store_tests": store_tests,
-            "seed": seed,
         }
-        check_settings(self.settings)
+        self.settings = {
+            "env_id": env_id,
+            **checked(StageSettings, given, "FollowObject"),
+            "seed": checked_whole("seed", seed, 0),
+        }
+        try:
+            check_plain(self.settings, "save()")
+        except ValueError as error:
+            warnings.warn(f"{error}; all else can be done", stacklevel=2)
         self.env_id = env_id
         self.full_id = full_id  # with the module that registers it, as given
-        self.imagine = imagine
-        self.seed = seed
+        self.imagine: bool = self.settings["imagine"]
+        self.seed: int = self.settings["seed"]
         self.report = report or (lambda sentence: None)
         self.object_stage = ObjectStage(
-            self.settings, self.report, needs_networks=reads_object_networks(algorithm or {})
+            self.settings,
+            self.report,
+            needs_networks=reads_object_networks(self.settings["algorithm"]),
         )
         self.env: VecEnv = self._robot_env("robot")
         self.horizon = int(self.env.get_attr("spec", indices=[0])[0].max_episode_steps)
@@ -173,8 +186,6 @@ class FollowObject:
         Raises:
             ValueError: an id, a key or a value that cannot be meant, with the nearest that can.
         """
-        from ..settings.presets import run_config
-
         config = run_config(env_id, method=method, preset=preset, seed=seed, overrides=overrides)
         return cls(env_id, seed=seed, **config.settings, **arguments)
 
@@ -208,7 +219,9 @@ class FollowObject:
     def check(self) -> None:
         """Raise a ValueError for a setting that a later stage would fail on."""
         if not self._checked:
-            check_algorithms(self.settings, self.env, self.object_stage.needs_networks)
+            check_algorithms(
+                self.settings, self.env, self.horizon, self.object_stage.needs_networks
+            )
             self._checked = True
 
     def prepare(self) -> HerDDPG:
@@ -258,7 +271,7 @@ class FollowObject:
             progress_bar: SB3's.
         """
         model = self.prepare()
-        remaining = total_timesteps - self.env_steps
+        remaining = checked_whole("total_timesteps", total_timesteps, 0) - self.env_steps
         if remaining <= 0:
             return self
         callbacks: list[BaseCallback] = []
@@ -342,11 +355,8 @@ class FollowObject:
         Raises:
             ValueError: a setting is a Python object, which a save does not hold.
         """
-        try:
-            saved = {**self.settings, "env_id": self.full_id}
-            settings = json.dumps(saved, indent=2).encode()
-        except TypeError as error:
-            raise ValueError(f"these settings cannot be saved: {error}") from error
+        check_plain(self.settings, "save()")
+        settings = json.dumps({**self.settings, "env_id": self.full_id}, indent=2).encode()
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         if self.predictor is not None:
@@ -369,7 +379,7 @@ class FollowObject:
         """
         folder = Path(folder)
         try:
-            settings = with_tuples(json.loads((folder / "settings.json").read_text()))
+            settings = json.loads((folder / "settings.json").read_text())
             env_id = known_id(settings["env_id"])
             predictor = None
             if (folder / "predictor").exists():

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-LEVELS = ("time", "path")
-SAMPLING = ("uniform", "max")
+from ..common.numbers import checked_number, checked_whole
+from ..settings.stages import CurriculumSettings
 
 
 class Curriculum:
@@ -39,33 +39,34 @@ class Curriculum:
         self,
         horizon: int,
         *,
-        p: float = 0.2,
-        threshold: float = 0.25,
-        finish_threshold: float = 0.0,
-        k_max: int = 2,
-        levels: str = "time",
-        n_levels: int = 25,
-        sampling: str = "uniform",
-        min_distance: float = 0.0,
+        p: float = CurriculumSettings.p,
+        threshold: float = CurriculumSettings.threshold,
+        finish_threshold: float = CurriculumSettings.finish_threshold,
+        k_max: int = CurriculumSettings.k_max,
+        levels: str = CurriculumSettings.levels,
+        n_levels: int = CurriculumSettings.n_levels,
+        sampling: str = CurriculumSettings.sampling,
+        min_distance: float = CurriculumSettings.min_distance,
     ) -> None:
-        _check_choice("levels", levels, LEVELS)
-        _check_choice("sampling", sampling, SAMPLING)
-        _check_integer("horizon", horizon, 1, None)
-        _check_integer("n_levels", n_levels, 1, None)
-        _check_share("p", p)
-        _check_share("threshold", threshold)
-        _check_share("finish_threshold", finish_threshold)
-        if not 0.0 <= min_distance < np.inf:
-            raise ValueError(f"min_distance must be >= 0 metres and finite, got {min_distance!r}.")
-        self.horizon = int(horizon)
-        self.levels = levels
-        self.n_levels = self.horizon if levels == "time" else int(n_levels)
-        self.p = float(p)
-        self.threshold = float(threshold)
-        self.finish_threshold = float(finish_threshold)
-        self.sampling = sampling
-        self.min_distance = float(min_distance)
-        self.k_max = self._checked_level("k_max", k_max)
+        settings = CurriculumSettings(
+            p=p,
+            threshold=threshold,
+            finish_threshold=finish_threshold,
+            k_max=k_max,
+            levels=levels,  # type: ignore[arg-type]  # a word is checked there
+            n_levels=n_levels,
+            sampling=sampling,  # type: ignore[arg-type]
+            min_distance=min_distance,
+        )
+        self.horizon = checked_whole("horizon", horizon, 1)
+        self.levels = settings.levels
+        self.n_levels = self.horizon if settings.levels == "time" else settings.n_levels
+        self.p = settings.p
+        self.threshold = settings.threshold
+        self.finish_threshold = settings.finish_threshold
+        self.sampling = settings.sampling
+        self.min_distance = settings.min_distance
+        self.k_max = checked_whole("k_max", settings.k_max, 1, self.n_levels)
         self._passed_last = False
 
     @property
@@ -106,7 +107,7 @@ class Curriculum:
         Raises:
             ValueError: ``success_rate`` is outside [0, 1].
         """
-        _check_share("success_rate", success_rate)
+        success_rate = checked_number("success_rate", success_rate, 0.0, 1.0)
         at_last = self.k_max == self.n_levels
         if self.finished or success_rate < (self.finish_threshold if at_last else self.threshold):
             return False
@@ -140,26 +141,5 @@ class Curriculum:
                 f"The curriculum's state has levels={theirs[0]!r} with {theirs[1]!r} levels, "
                 f"but this curriculum has levels={self.levels!r} with {self.n_levels}."
             )
-        self.k_max = self._checked_level("k_max", state["k_max"])
+        self.k_max = checked_whole("k_max", state["k_max"], 1, self.n_levels)
         self._passed_last = bool(state["passed_last"])
-
-    def _checked_level(self, name: str, level: int) -> int:
-        _check_integer(name, level, 1, self.n_levels)
-        return int(level)
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {list(choices)}, got {value!r}.")
-
-
-def _check_integer(name: str, value: int, low: int, high: int | None) -> None:
-    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not is_integer or value < low or (high is not None and value > high):
-        upper = f"in {low}..{high}" if high is not None else f">= {low}"
-        raise ValueError(f"{name} must be a whole number {upper}, got {value!r}.")
-
-
-def _check_share(name: str, value: float) -> None:
-    if not 0.0 <= value <= 1.0:  # also refuses NaN
-        raise ValueError(f"{name} must lie in [0, 1], got {value!r}.")

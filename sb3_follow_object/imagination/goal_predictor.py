@@ -12,22 +12,21 @@ from pathlib import Path
 import numpy as np
 import safetensors.torch
 import torch
-from stable_baselines3.common.utils import get_device
 from torch import nn
 
 from ..common.files import atomic_write
+from ..common.numbers import checked_whole
+from ..common.torch_helpers import usable_device
+from ..settings.learning import PredictorSettings
 from .predictor_files import (
     FACTS_FILE,
     FORMAT,
     INPUTS,
-    LAYERS_LIMIT,
     POSITION,
     SCALES,
     TENSORS_FILE,
-    WIDTH_LIMIT,
     checked_facts,
     checked_tensors,
-    valid_hidden,
 )
 
 # Metres. The start's height is the same in all paths up to the solver's noise; divided by that
@@ -87,13 +86,13 @@ class GoalPredictor:
         env_id: str,
         physics: str,
         object_on_table: bool | None = None,
-        hidden: Sequence[int] = (512, 512, 512),
-        learning_rate: float = 1e-3,
-        batch_size: int = 128,
-        epochs: int = 30,
-        test_share: float = 0.3,
+        hidden: Sequence[int] = PredictorSettings.hidden,
+        learning_rate: float = PredictorSettings.learning_rate,
+        batch_size: int = PredictorSettings.batch_size,
+        epochs: int = PredictorSettings.epochs,
+        test_share: float = PredictorSettings.test_share,
         seed: int = 0,
-        device: str = "auto",
+        device: str = PredictorSettings.device,
         progress: Progress | None = None,
     ) -> GoalPredictor:
         """Fit F_phi to paths of the object policy by mean squared error (paper, equation 3).
@@ -122,10 +121,18 @@ class GoalPredictor:
             ValueError: an argument has a wrong shape or range, or holds NaN or infinity.
         """
         paths, goals = _checked_paths(paths, goals)
-        cls.check_fit(hidden, learning_rate, batch_size, epochs, test_share, device)
+        settings = PredictorSettings(
+            hidden=hidden,
+            learning_rate=learning_rate,
+            batch_size=batch_size,
+            epochs=epochs,
+            test_share=test_share,
+            device=device,
+        )
+        on = usable_device(settings.device)
         n, horizon = len(paths), paths.shape[1] - 1
-        n_test = min(max(round(test_share * n), 1), n - 1)
-        generator = torch.Generator().manual_seed(seed)
+        n_test = min(max(round(settings.test_share * n), 1), n - 1)
+        generator = torch.Generator().manual_seed(checked_whole("seed", seed))
         order = torch.randperm(n, generator=generator).numpy()
         test, train = order[:n_test], order[n_test:]
 
@@ -136,18 +143,17 @@ class GoalPredictor:
             "output_mean": torch.from_numpy(targets.mean(axis=0)),
             "output_std": torch.from_numpy(np.maximum(targets.std(axis=0), SMALLEST_STD)),
         }
-        network = _network(hidden)
+        network = _network(settings.hidden)
         _initialise(network, generator)
         x = (torch.from_numpy(inputs) - tensors["input_mean"]) / tensors["input_std"]
         y = (torch.from_numpy(targets) - tensors["output_mean"]) / tensors["output_std"]
-        on = get_device(device)
         _train(
             network.to(on),
             x.float().to(on),
             y.float().to(on),
-            learning_rate=learning_rate,
-            batch_size=batch_size,
-            epochs=epochs,
+            learning_rate=settings.learning_rate,
+            batch_size=settings.batch_size,
+            epochs=settings.epochs,
             generator=generator,
             progress=progress,
         )
@@ -155,7 +161,7 @@ class GoalPredictor:
         tensors |= {name: value.detach().clone() for name, value in weights.items()}
         predictor = cls(
             tensors,
-            hidden=hidden,
+            hidden=settings.hidden,
             horizon=horizon,
             env_id=env_id,
             physics=physics,
@@ -166,33 +172,6 @@ class GoalPredictor:
         distance = np.linalg.norm(imagined[:, 1:] - paths[test, 1:], axis=2)
         predictor.error_mm = 1000.0 * distance.mean(axis=0)
         return predictor
-
-    @staticmethod
-    def check_fit(
-        hidden: Sequence[int] = (512, 512, 512),
-        learning_rate: float = 1e-3,
-        batch_size: int = 128,
-        epochs: int = 30,
-        test_share: float = 0.3,
-        device: str = "auto",
-    ) -> None:
-        """Raise a ValueError unless `fit` can do with these arguments."""
-        if not valid_hidden(list(hidden)):
-            raise ValueError(
-                f"hidden must be 1 to {LAYERS_LIMIT} widths in 1..{WIDTH_LIMIT}, got {hidden!r}."
-            )
-        if not 0.0 < learning_rate < np.inf:
-            raise ValueError(f"learning_rate must be > 0 and finite, got {learning_rate!r}.")
-        if batch_size < 1 or epochs < 1:
-            raise ValueError(
-                f"batch_size and epochs must be >= 1, got {batch_size!r} and {epochs!r}."
-            )
-        if not 0.0 < test_share < 1.0:
-            raise ValueError(f"test_share must lie between 0 and 1, got {test_share!r}.")
-        try:
-            get_device(device)
-        except RuntimeError as error:
-            raise ValueError(f"device {device!r} cannot be used: {error}") from error
 
     def to(self, device: torch.device | str) -> GoalPredictor:
         """Imagine on this device from now on; what `save` writes stays the same."""
@@ -212,19 +191,27 @@ class GoalPredictor:
             positions, shape (n, 3) float64, metres.
 
         Raises:
-            ValueError: a shape is wrong or a k lies outside 1..T.
+            ValueError: a shape is wrong, a k is no whole number in 1..T, or a start or a goal is
+                not finite.
         """
-        start, goal, k = np.asarray(start), np.asarray(goal), np.asarray(k)
+        start, goal, k = (np.asarray(values) for values in (start, goal, k))
         n = len(k) if k.ndim == 1 else -1
         if start.shape != (n, POSITION) or goal.shape != (n, POSITION):
             raise ValueError(
                 f"start, goal and k must have the shapes (n, 3), (n, 3) and (n,), "
                 f"got {start.shape}, {goal.shape} and {k.shape}."
             )
-        if n and not (k.min() >= 1 and k.max() <= self.horizon):
+        if n == 0:
+            return np.zeros((0, POSITION))
+        for name, values in (("start", start), ("goal", goal), ("k", k)):
+            if not (np.issubdtype(values.dtype, np.number) and np.isfinite(values).all()):
+                raise ValueError(f"{name} must hold finite numbers, got others in it.")
+        if not (k.min() >= 1 and k.max() <= self.horizon):
             raise ValueError(
                 f"k must lie in 1..{self.horizon}, got values from {k.min()} to {k.max()}."
             )
+        if (k != np.round(k)).any():
+            raise ValueError(f"k must hold whole numbers, got {k[k != np.round(k)][0]} in it.")
         inputs = np.concatenate([start, goal, k[:, None]], axis=1, dtype=np.float64)
         scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
         with torch.inference_mode():

@@ -14,6 +14,8 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError
 
+from ..settings.kinds import LAYERS_LIMIT, WIDTH_LIMIT
+
 POSITION = 3  # coordinates of an object position
 INPUTS = 2 * POSITION + 1  # o_1, g, k
 
@@ -22,8 +24,6 @@ FACTS_FILE = "predictor.json"
 FORMAT = 1
 FACTS_LIMIT = 1 << 20  # bytes
 HEADER_LIMIT = 1 << 20  # bytes that a tensors file may hold beside the numbers
-LAYERS_LIMIT = 16
-WIDTH_LIMIT = 8192
 HORIZON_LIMIT = 100_000
 # Names and lengths of the tensors that are not weights.
 SCALES = {

@@ -13,15 +13,17 @@ from stable_baselines3.common.torch_layers import create_mlp, get_actor_critic_a
 from torch import nn
 
 from ..common.array_trees import load_tree, save_tree
+from ..common.numbers import checked_whole
 from ..common.torch_helpers import lowest
 from ..ddpg.her_ddpg import HerDDPG
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
 from ..imagination.predictor_files import valid_hidden
+from ..settings.kinds import CRITICS_LIMIT
+from ..settings.learning import InverseSettings
 
 FILE = "object_networks.safetensors"
 FORMAT = 1
 OBSERVATION, GOAL, ACTION = 12, 3, 7  # of the object's environment
-_CRITICS_LIMIT = 8
 
 
 class ObjectNetworks(nn.Module):
@@ -90,10 +92,10 @@ class ObjectNetworks(nn.Module):
         env_id: str,
         physics: str,
         *,
-        hidden: Sequence[int] = (256, 256, 256),
-        learning_rate: float = 1e-3,
-        batch_size: int = 256,
-        updates: int = 3000,
+        hidden: Sequence[int] = InverseSettings.hidden,
+        learning_rate: float = InverseSettings.learning_rate,
+        batch_size: int = InverseSettings.batch_size,
+        updates: int = InverseSettings.updates,
         seed: int = 0,
         between_updates: Callable[[], None] = lambda: None,
     ) -> ObjectNetworks:
@@ -116,7 +118,10 @@ class ObjectNetworks(nn.Module):
             ValueError: an argument is outside its range, or the policy has other activations than
                 ReLU.
         """
-        cls.check_fit(hidden, learning_rate, batch_size, updates)
+        settings = InverseSettings(
+            hidden=hidden, learning_rate=learning_rate, batch_size=batch_size, updates=updates
+        )
+        seed = checked_whole("seed", seed)
         policy = model.policy
         assert policy.net_arch is not None
         if policy.activation_fn is not nn.ReLU:
@@ -132,7 +137,7 @@ class ObjectNetworks(nn.Module):
             physics,
             pi=pi,
             qf=qf,
-            inverse=hidden,
+            inverse=settings.hidden,
             n_critics=len(model.critic.q_networks),
             layer_norm=policy.critic_layer_norm,
             clip=extractor.clip,
@@ -141,29 +146,13 @@ class ObjectNetworks(nn.Module):
         networks.nu.load_state_dict(model.actor.mu.state_dict())
         for copy, critic in zip(networks.critics, model.critic.q_networks, strict=True):
             copy.load_state_dict(critic.state_dict())
-        networks._fit_inverse(model, learning_rate, batch_size, updates, seed, between_updates)
+        networks._fit_inverse(model, settings, seed, between_updates)
         return networks
-
-    @staticmethod
-    def check_fit(
-        hidden: Sequence[int] = (256, 256, 256),
-        learning_rate: float = 1e-3,
-        batch_size: int = 256,
-        updates: int = 3000,
-    ) -> None:
-        """Raise a ValueError unless `learned` can fit the inverse model with these arguments."""
-        if not hidden or min(*hidden, batch_size, updates) < 1 or learning_rate <= 0.0:
-            raise ValueError(
-                f"inverse_fit: hidden ({hidden}), batch_size ({batch_size}) and updates ({updates})"
-                f" must be at least 1 and learning_rate ({learning_rate}) > 0"
-            )
 
     def _fit_inverse(
         self,
         model: HerDDPG,
-        learning_rate: float,
-        batch_size: int,
-        updates: int,
+        settings: InverseSettings,
         seed: int,
         between_updates: Callable[[], None],
     ) -> None:
@@ -174,10 +163,10 @@ class ObjectNetworks(nn.Module):
                 if isinstance(layer, nn.Linear):
                     layer.reset_parameters()
         self.inverse.requires_grad_(True)
-        optimizer = th.optim.Adam(self.inverse.parameters(), lr=learning_rate)
+        optimizer = th.optim.Adam(self.inverse.parameters(), lr=settings.learning_rate)
         losses: list[th.Tensor] = []
-        for _ in range(updates):
-            data = model.replay_buffer.sample(batch_size)
+        for _ in range(settings.updates):
+            data = model.replay_buffer.sample(settings.batch_size)
             inferred = self.infer(
                 data.observations["observation"],
                 data.next_observations["observation"],
@@ -278,7 +267,7 @@ def _check_shape(shape: Any) -> None:
     for name in ("pi", "qf", "inverse"):
         if not valid_hidden(shape[name]):
             raise ValueError(f"{name} has hidden layers {shape[name]!r}")
-    if type(shape["n_critics"]) is not int or not 1 <= shape["n_critics"] <= _CRITICS_LIMIT:
+    if type(shape["n_critics"]) is not int or not 1 <= shape["n_critics"] <= CRITICS_LIMIT:
         raise ValueError(f"n_critics is {shape['n_critics']!r}")
     if type(shape["layer_norm"]) is not bool or not float(shape["clip"]) > 0.0:
         raise ValueError("layer_norm or clip cannot be meant")

@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..common.providers import provider
-from ..ddpg.auxiliary import AuxiliaryReward, Transitions, check_auxiliary
+from ..ddpg.auxiliary import AuxiliaryReward, Transitions, reward_class
 from ..envs import IDS, object_state, physics_id
 from .networks import ObjectNetworks
 
@@ -81,7 +81,7 @@ def reads_object_networks(algorithm: Mapping[str, Any]) -> bool:
         ValueError: the auxiliary reward's settings are wrong, or name networks of their own.
     """
     settings = algorithm.get("auxiliary")
-    if settings is None or check_auxiliary(settings) is not SldrReward:
+    if settings is None or reward_class(settings) is not SldrReward:
         return False
     if settings.get("object_networks", AUTO) != AUTO:
         raise ValueError(

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..settings.learning import CherSettings
+
 # The weight of proximity grows with every batch; beyond this, diversity has long stopped counting.
 _MAX_GROWTH = 1e9
 _BLOCK = 1 << 21  # distances held at once
@@ -37,19 +39,16 @@ class GoalSelection:
 
     def __init__(
         self,
-        candidates: int = 2,
-        picks: int = 3,
-        weight: float = 1.0,
-        growth: float = 1.0001,
+        candidates: int = CherSettings.candidates,
+        picks: int = CherSettings.picks,
+        weight: float = CherSettings.weight,
+        growth: float = CherSettings.growth,
     ) -> None:
-        if candidates < 1 or picks < 1:
-            raise ValueError(f"cher: candidates ({candidates}) and picks ({picks}) must be >= 1")
-        if weight < 0.0 or growth < 1.0:
-            raise ValueError(f"cher: weight ({weight}) must be >= 0 and growth ({growth}) >= 1")
-        self.candidates = candidates
-        self.picks = picks
-        self.weight = weight
-        self.growth = growth
+        settings = CherSettings(candidates=candidates, picks=picks, weight=weight, growth=growth)
+        self.candidates = settings.candidates
+        self.picks = settings.picks
+        self.weight = settings.weight
+        self.growth = settings.growth
         self.n_batches = 0
 
     def proximity_weights(self, n_batches: int) -> np.ndarray:

@@ -13,14 +13,17 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from ..common.numbers import checked_whole
 from ..imagination.imagined_goals import imagine
 from ..imagination.vec_env import imagination_of
-from ..settings.keywords import check_keywords
+from ..settings.learning import ReplaySettings
+from ..settings.sizes import check_buffer
 from .cher import GoalSelection
 from .episode_table import EpisodeTable
 from .record_buffer import NEXT_DESIRED, RecordReplayBuffer, check_finite
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
+Strategy = GoalSelectionStrategy | str
 GRAVITY = 9.81  # m/s^2
 IMAGINED_RATIO = "imagined_ratio > 0"  # what needs an environment that imagines goals
 
@@ -60,8 +63,8 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
     The other arguments are HerReplayBuffer's.
 
     Raises:
-        ValueError: if a ratio is outside [0, 1], or imagined goals are asked for without the
-            wrapper that imagines them.
+        ValueError: an argument is outside its range, imagined goals are asked for without the
+            wrapper that imagines them, or, at the first step, an episode does not fit.
     """
 
     def __init__(
@@ -73,32 +76,36 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         device: th.device | str = "auto",
         n_envs: int = 1,
         optimize_memory_usage: bool = False,
-        handle_timeout_termination: bool = True,
-        n_sampled_goal: int = 4,
-        goal_selection_strategy: GoalSelectionStrategy | str = "future",
-        copy_info_dict: bool = False,
-        imagined_ratio: float = 0.0,
-        moved_ratio: float = 0.0,
-        moved_distance: float = 0.01,
-        moved_priority: str = "uniform",
-        step_seconds: float = 0.04,
-        min_goal_distance: float = 0.0,
+        handle_timeout_termination: bool = ReplaySettings.handle_timeout_termination,
+        n_sampled_goal: int = ReplaySettings.n_sampled_goal,
+        goal_selection_strategy: Strategy = ReplaySettings.goal_selection_strategy,
+        copy_info_dict: bool = ReplaySettings.copy_info_dict,
+        imagined_ratio: float = ReplaySettings.imagined_ratio,
+        moved_ratio: float = ReplaySettings.moved_ratio,
+        moved_distance: float = ReplaySettings.moved_distance,
+        moved_priority: str = ReplaySettings.moved_priority,
+        step_seconds: float = ReplaySettings.step_seconds,
+        min_goal_distance: float = ReplaySettings.min_goal_distance,
         cher: dict[str, Any] | None = None,
         reward_function: RewardFunction | None = None,
         seed: int | None = None,
     ):
-        if moved_priority not in ("uniform", "energy"):
-            raise ValueError(f"moved_priority is {moved_priority!r}; 'uniform' and 'energy' exist")
-        if step_seconds <= 0.0:
-            raise ValueError(f"step_seconds is {step_seconds}; it must be > 0")
-        if moved_distance < 0.0 or min_goal_distance < 0.0:
-            raise ValueError(
-                f"moved_distance ({moved_distance}) and min_goal_distance ({min_goal_distance}) "
-                "must be >= 0 metres"
-            )
-        for name, ratio in (("imagined_ratio", imagined_ratio), ("moved_ratio", moved_ratio)):
-            if not 0.0 <= ratio <= 1.0:
-                raise ValueError(f"{name} is {ratio}; it must lie in [0, 1]")
+        settings = ReplaySettings(
+            n_sampled_goal=n_sampled_goal,
+            goal_selection_strategy=goal_selection_strategy,
+            handle_timeout_termination=handle_timeout_termination,
+            copy_info_dict=copy_info_dict,
+            imagined_ratio=imagined_ratio,
+            moved_ratio=moved_ratio,
+            moved_distance=moved_distance,
+            moved_priority=moved_priority,  # type: ignore[arg-type]  # a word is checked there
+            step_seconds=step_seconds,
+            min_goal_distance=min_goal_distance,
+            cher=cher,
+            seed=seed,
+        )
+        n_envs = checked_whole("n_envs", n_envs, 1)
+        buffer_size = checked_whole("buffer_size", buffer_size, 1)
         super().__init__(
             buffer_size,
             observation_space,
@@ -107,38 +114,38 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
             device=device,
             n_envs=n_envs,
             optimize_memory_usage=optimize_memory_usage,
-            handle_timeout_termination=handle_timeout_termination,
-            n_sampled_goal=n_sampled_goal,
-            goal_selection_strategy=goal_selection_strategy,
-            copy_info_dict=copy_info_dict,
+            handle_timeout_termination=settings.handle_timeout_termination,
+            n_sampled_goal=settings.n_sampled_goal,
+            goal_selection_strategy=settings.goal_selection_strategy,
+            copy_info_dict=settings.copy_info_dict,
         )
-        self.imagined_ratio = imagined_ratio
-        self.moved_ratio = moved_ratio
-        self.moved_distance = moved_distance
-        self.moved_priority = moved_priority
-        self.step_seconds = step_seconds
-        self.min_goal_distance = min_goal_distance
-        if cher is not None:
-            check_keywords("cher", cher, GoalSelection.__init__)
-        self.selection = None if cher is None else GoalSelection(**cher)
+        self.imagined_ratio = settings.imagined_ratio
+        self.moved_ratio = settings.moved_ratio
+        self.moved_distance = settings.moved_distance
+        self.moved_priority = settings.moved_priority
+        self.step_seconds = settings.step_seconds
+        self.min_goal_distance = settings.min_goal_distance
+        self.selection = None if settings.cher is None else GoalSelection(**settings.cher)
         self.reward_function = reward_function
         goal_shape = self.observations["desired_goal"].shape
-        if moved_priority == "energy" and goal_shape[-1] < 3:
+        if self.moved_priority == "energy" and goal_shape[-1] < 3:
             raise ValueError(
                 f"moved_priority 'energy' reads a height in metres from goals of 3 numbers; these "
                 f"have {goal_shape[-1]}: take 'uniform'"
             )
-        if imagined_ratio > 0.0:
+        if self.imagined_ratio > 0.0:
             imagination_of(env, IMAGINED_RATIO)  # raises now rather than at the first sample
-        self.rng = np.random.default_rng(np.random.randint(2**31) if seed is None else seed)
+        self.rng = np.random.default_rng(
+            np.random.randint(2**31) if settings.seed is None else settings.seed
+        )
 
         self.original_goals = np.zeros(
-            goal_shape if imagined_ratio > 0.0 else (0,), dtype=np.float32
+            goal_shape if self.imagined_ratio > 0.0 else (0,), dtype=np.float32
         )
-        if not copy_info_dict:
+        if not self.copy_info_dict:
             self.infos = np.empty((0, n_envs), dtype=object)  # one unused dict a slot otherwise
         # Whether what a slot achieved is far enough from where its episode began.
-        self._far = np.zeros(self.dones.shape if min_goal_distance > 0.0 else (0,), dtype=bool)
+        self._far = np.zeros(self.dones.shape if self.min_goal_distance > 0.0 else (0,), dtype=bool)
         self.table = EpisodeTable()
         self.n_added = 0  # time-steps so far
         self.revision = 0  # counts contents that were loaded over the earlier ones
@@ -159,6 +166,8 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         Raises:
             ValueError: an environment returned NaN or infinity; nothing of the step is stored.
         """
+        if self.n_added == 0:
+            self.check_size()
         check_finite(obs, next_obs, action, reward)
         pos = self.pos
         rows = [
@@ -264,6 +273,17 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         if self.min_goal_distance > 0.0:
             stores["far"] = self._far
         return stores
+
+    def check_size(self) -> None:
+        """Raise a ValueError where the buffer cannot hold an episode of every environment.
+
+        Not done as it is made: what is loaded only to act may have next to none.
+        """
+        if self.env is None or not self.env.has_attr("spec"):
+            return
+        spec = self.env.get_attr("spec", indices=[0])[0]
+        if spec is not None and spec.max_episode_steps is not None:
+            check_buffer(self.buffer_size, self.n_envs, spec.max_episode_steps)
 
     def check_ready(self) -> None:
         """Raise RuntimeError while there is nothing to draw from."""

@@ -26,6 +26,7 @@ from ..envs import make_vec
 from ..follow_object.follow_object import FollowObject
 from ..object_stage.policy import StopWhenSolved
 from ..settings.run_config import RunConfig
+from ..settings.sizes import check_sizes, idle_robot
 from .checkpoints import Checkpoints, checkpoint_files, load_newest
 from .object_stage_files import load_object_stage, save_object_stage
 from .run_callbacks import CheckpointCallback, Progress, RunCallback, StopSignals
@@ -93,6 +94,9 @@ def train(
             remove_half_written(folder)
         else:
             check_empty(folder)
+            check_sizes(config)
+            if sentence := idle_robot(config):
+                report(Trouble(sentence))
         th.set_num_threads(1)  # nothing but the robot's gradient steps gains from more
         stop = stack.enter_context(StopSignals())
         run = FollowObject(

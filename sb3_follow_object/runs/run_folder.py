@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from ..common.files import LOCK, atomic_write
-from ..settings.run_config import RunConfig
+from ..settings.run_config import CONFIG, RunConfig
 from .checkpoints import checkpoint_files
 
-CONFIG, RESULT, EVALUATIONS = "config.json", "result.json", "evaluations.csv"
+RESULT, EVALUATIONS = "result.json", "evaluations.csv"
 POLICY, BEST_POLICY = "policy.safetensors", "best_policy.safetensors"
 VERSIONS = "versions.json"
 CROSS_TESTS = "cross_tests.json"  # the policy on other tasks

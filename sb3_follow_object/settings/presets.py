@@ -2,37 +2,25 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.td3.policies import TD3Policy
-
 from .. import zoo_configs
 from ..common.plain_yaml import load_yaml
-from ..common.providers import provided
 from ..common.suggestions import did_you_mean
-from ..ddpg.auxiliary import KIND, check_auxiliary, reward_class
-from ..ddpg.her_ddpg import HerDDPG
-from ..ddpg.policies import HerPolicy
 from ..envs import IDS, object_id
 from ..envs.goal_envs import check_task
 from ..envs.registration import import_task
 from ..envs.task_table import BUILT_IN
-from ..follow_object.follow_object import FollowObject
-from ..imagination.curriculum import Curriculum
-from ..imagination.goal_predictor import GoalPredictor
-from ..object_stage.networks import ObjectNetworks
-from ..replay.cher import GoalSelection
-from ..replay.her_replay_buffer import FollowObjectReplayBuffer
-from ..runs.run_folder import CONFIG
-from .keywords import with_tuples
+from .fields import Group, Setting, check_names, settings_of
+from .learning import AlgorithmSettings, check_auxiliary
 from .methods import METHODS as METHODS
-from .ranges import check_value
-from .run_config import RunConfig
+from .run_config import CONFIG, RunConfig
+from .sizes import check_sizes
+from .stages import StageSettings
 
 PRESETS = ("default", "paper")
 
@@ -46,21 +34,8 @@ _MARKS = (
 # The callback's keyword arguments, and what FollowObject calls them.
 _CALLBACK_NAMES = {"every": "test_every", "n_episodes": "n_test_episodes", "store": "store_tests"}
 
-# What the run itself decides, or what YAML cannot hold.
-_NOT_SETTINGS = {"self", "env", "env_id", "seed", "settings", "method", "imagine", "algorithm"}
-_NOT_SETTINGS |= {"module", "update_threads"}
-_NOT_SETTINGS |= {
-    "model",
-    "object_networks",
-    "predictor",
-    "report",
-    "_init_setup_model",
-    "tensorboard_log",
-    "action_noise",
-}
-_NOT_SETTINGS |= {"replay_buffer_class", "total_timesteps", "horizon", "args", "kwargs"}
-_NOT_SETTINGS |= {"observation_space", "action_space", "lr_schedule", "reward_function"}
-_NOT_SETTINGS |= {"paths", "goals", "physics", "progress", "n_features"}
+# Whose settings stand side by side in an entry.
+_GROUPS: tuple[type[Group], ...] = (RunConfig, StageSettings, AlgorithmSettings)
 
 
 def preset_file(method: str, preset: str = "default") -> Path:
@@ -106,19 +81,19 @@ def run_config(
     settings = _flattened(entry, path)
     has_object_stage = imagine or _auxiliary_name(settings) == "sldr"
     if has_object_stage and env_id not in IDS:
+        robots = sorted(name for name, (_, alone) in IDS.items() if not alone)
         raise ValueError(
             f"{env_id!r} has no environment of its object alone, which imagined goals and SLDR's "
-            f"reward come from; train it with --method her, or one of {', '.join(sorted(IDS))}"
+            f"reward come from; train it with --method her, or one of {', '.join(robots)}"
         )
     if has_object_stage and _find(entries, object_id(env_id)) is not None:
         settings |= _object_stage(_entry(entries, object_id(env_id), path), path)
-    schema = _schema()
     changes: dict[str, Any] = {}
     for name, value in (overrides or {}).items():
         _override(changes, name, value)
         _override(settings, name, value)
-    _check(changes, schema, "--set")
-    _check(settings, schema, str(path))
+    _checked(changes, "--set")
+    settings = _checked(settings, str(path))
     if settings.get("auxiliary"):
         check_auxiliary(settings["auxiliary"])
     found = method_of(settings, imagine)
@@ -128,21 +103,24 @@ def run_config(
             f"not {method!r}: {_MARKS}"
         )
 
-    total_timesteps = settings.pop("n_timesteps", RunConfig.total_timesteps)
-    of_run = {name: settings.pop(name) for name in list(settings) if name in schema["run"]}
-    of_class: dict[str, Any] = {"imagine": imagine}
-    of_class |= {name: settings.pop(name) for name in list(settings) if name in schema["class"]}
-    if settings:
-        of_class["algorithm"] = settings
-    return RunConfig(
+    of_run, of_class, of_algorithm = (
+        {known[name].field: settings[name] for name in settings if name in known}
+        for known in map(_known, _GROUPS)
+    )
+    config = RunConfig(
         env_id,
         found,
         seed=seed,
-        total_timesteps=total_timesteps,
-        settings=with_tuples(of_class),
+        settings={
+            "imagine": imagine,
+            **of_class,
+            **({"algorithm": of_algorithm} if of_algorithm else {}),
+        },
         module=module or None,
         **of_run,
     )
+    check_sizes(config)
+    return config
 
 
 def method_of(settings: Mapping[str, Any], imagine: bool) -> str:
@@ -172,7 +150,7 @@ def load_config(folder: str | os.PathLike[str]) -> RunConfig:
     path = Path(folder) / CONFIG
     try:
         saved = json.loads(path.read_text())
-        config = RunConfig(**{**saved, "settings": with_tuples(saved["settings"])})
+        config = RunConfig(**{**saved, "settings": saved["settings"]})  # without, it is none
         import_task(config.full_id)
         return config
     except FileNotFoundError as error:
@@ -258,15 +236,15 @@ def _flattened(entry: dict[str, Any], path: Path) -> dict[str, Any]:
     """Return an entry with the arguments of its wrapper, callback and environments as settings."""
     settings = _plain(entry)
     for arguments in _named(settings, "env_wrapper", path).values():
-        _check_names(arguments, ("predictor", "curriculum"), f"{path}: {WRAPPER}")
+        check_names(arguments, ("predictor", "curriculum"), f"{path}: {WRAPPER}")
         if arguments.get("predictor", "auto") != "auto":
             raise ValueError(f"{path}: a run makes its own predictor; leave it out or say auto")
         settings["curriculum"] = arguments.get("curriculum") or {}
     for arguments in _named(settings, "callback", path).values():
-        _check_names(arguments, _CALLBACK_NAMES, f"{path}: {CALLBACK}")
+        check_names(arguments, _CALLBACK_NAMES, f"{path}: {CALLBACK}")
         settings |= {_CALLBACK_NAMES[name]: value for name, value in arguments.items()}
     env_kwargs = settings.get("env_kwargs") or {}
-    _check_names(env_kwargs, ("reward_type",), f"{path}: env_kwargs")
+    check_names(env_kwargs, ("reward_type",), f"{path}: env_kwargs")
     settings |= env_kwargs
     return {
         name: value
@@ -284,7 +262,7 @@ def _object_stage(entry: dict[str, Any], path: Path) -> dict[str, Any]:
         if name in algorithm:
             settings[ours] = algorithm.pop(name)
     env_kwargs = algorithm.pop("env_kwargs", {})
-    _check_names(env_kwargs, ("on_table",), f"{path}: env_kwargs of the object")
+    check_names(env_kwargs, ("on_table",), f"{path}: env_kwargs of the object")
     return settings | {f"object_{name}": value for name, value in env_kwargs.items()}
 
 
@@ -297,74 +275,16 @@ def _override(settings: dict[str, Any], name: str, value: Any) -> None:
     settings[last] = value
 
 
-def _parameters(*functions: Callable[..., Any]) -> dict[str, Any]:
-    """Return names and defaults of what can be set; the later function's default wins."""
-    return {
-        name: parameter.default
-        for function in functions
-        for name, parameter in inspect.signature(function).parameters.items()
-        if name not in _NOT_SETTINGS
-    }
+def _known(group: type[Group]) -> dict[str, Setting]:
+    """Return what data can say of a group."""
+    return {name: each for name, each in settings_of(group).items() if each.data}
 
 
-def _schema() -> dict[str, dict[str, Any]]:
-    """Return everything that can be set and its default; a dict has settings of its own."""
-    algorithm = _parameters(HerDDPG.__init__)
-    algorithm["target_clip"] = None  # a pair, a word or nothing: the algorithm judges
-    buffer = _parameters(FollowObjectReplayBuffer.__init__)
-    for name in ("buffer_size", "device", "n_envs", "optimize_memory_usage"):
-        del buffer[name]  # the algorithm's
-    buffer["cher"] = _parameters(GoalSelection.__init__)
-    algorithm["replay_buffer_kwargs"] = buffer
-    algorithm["auxiliary"] = {"name": "rnd", "weight": 1.0}
-    for name in provided(KIND):  # which settings belong to which reward is the algorithm's to check
-        algorithm["auxiliary"] |= _parameters(reward_class(name).__init__)
-    algorithm["policy_kwargs"] = _parameters(TD3Policy.__init__, HerPolicy.__init__)
-    of_class = _parameters(FollowObject.__init__)
-    of_class["curriculum"] = _parameters(Curriculum.__init__)
-    of_class["object_algorithm"] = {n: v for n, v in algorithm.items() if n != "policy"}
-    of_class["predictor_fit"] = _parameters(GoalPredictor.fit)
-    del of_class["predictor_fit"]["object_on_table"]  # the class's
-    of_class["inverse_fit"] = _parameters(ObjectNetworks.check_fit)
-    return {"algorithm": algorithm, "class": of_class, "run": _parameters(RunConfig)}
-
-
-def _check(settings: dict[str, Any], schema: dict[str, dict[str, Any]], where: str) -> None:
-    known = {name: default for part in schema.values() for name, default in part.items()}
-    _check_tree(settings, {"n_timesteps": RunConfig.total_timesteps, **known}, where)
-
-
-def _check_tree(settings: dict[str, Any], known: dict[str, Any], where: str) -> None:
-    _check_names(settings, known, where)
-    for name, value in settings.items():
-        default = known[name]
-        if isinstance(default, dict):
-            if value is not None and not isinstance(value, dict):
-                raise ValueError(f"{where}: {name} must be a mapping, not {value!r}")
-            _check_tree(value or {}, default, f"{where}: {name}")
-        elif not _fits(value, default):
-            kind = "true or false" if isinstance(default, bool) else f"like {default!r}"
-            raise ValueError(f"{where}: {name} must be {kind}, not {value!r}")
-        elif value is not None or default not in (None, inspect.Parameter.empty):
-            check_value(name, value, where)
-
-
-def _check_names(settings: Any, known: Any, where: str) -> None:
-    if not isinstance(settings, dict):
-        raise ValueError(f"{where} must be a mapping, not {settings!r}")
-    for name in settings:
-        if name not in known:
-            raise ValueError(f"{where} has no setting {name!r}{did_you_mean(name, known)}")
-
-
-def _fits(value: Any, default: Any) -> bool:
-    """Whether a value can stand where a default of a plain type does; others are not judged."""
-    if isinstance(default, bool):
-        return isinstance(value, bool)
-    if isinstance(default, int | float):
-        kinds = (int,) if isinstance(default, int) else (int, float)
-        return isinstance(value, kinds) and not isinstance(value, bool)
-    return not isinstance(default, str) or isinstance(value, str)
+def _checked(settings: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return an entry's settings as the groups have them."""
+    known = {name: each for group in _GROUPS for name, each in _known(group).items()}
+    check_names(settings, known, where)
+    return {name: known[name].checked(value, where, data=True) for name, value in settings.items()}
 
 
 def _plain(value: Any) -> Any:

@@ -134,12 +134,12 @@ def test_log_has_means_of_an_update_phase() -> None:
     [
         ({"name": "rdn"}, "auxiliary has no reward 'rdn'; did you mean 'rnd'"),
         ({"weight": 1.0}, "give a mapping with a name"),
-        ("rnd", "give a mapping with a name"),
+        ("rnd", "auxiliary must be a mapping, not 'rnd'"),
         ({"name": "rnd", "max_bonis": 1}, "no setting 'max_bonis'; did you mean 'max_bonus'"),
         ({"name": "rnd", "n_features": 1}, r"auxiliary \(rnd\) has no setting 'n_features'"),
-        ({"name": "rnd", "weight": -1.0}, "weight is -1.0; it must be >= 0"),
-        ({"name": "rnd", "learning_rate": 0.0}, "must be > 0"),
-        ({"name": "rnd", "n_outputs": 0}, "must be >= 1"),
+        ({"name": "rnd", "weight": -1.0}, "weight is -1.0; it must lie in"),
+        ({"name": "rnd", "learning_rate": 0.0}, "learning_rate is 0.0; it must lie in"),
+        ({"name": "rnd", "n_outputs": 0}, "n_outputs is 0; it must be at least 1"),
     ],
 )
 def test_bad_settings_are_one_sentence(auxiliary: Any, sentence: str) -> None:

@@ -105,7 +105,10 @@ def test_a_grid_calls_it_by_its_short_name(own: Task, tmp_path: Path) -> None:
         (lambda: Region("gripper", (0.1, 0.0), (0.0, 0.1)), "is empty"),
         (lambda: Region("robot", (0.0, 0.0), (0.1, 0.1)), "'gripper' or 'table'"),  # type: ignore[arg-type]
         (lambda: Task("Push Past", NEAR, FAR), "letters and digits"),
-        (lambda: Task("PushPast", NEAR, FAR, horizon=0), "whole number >= 1"),
+        (
+            lambda: Task("PushPast", NEAR, FAR, horizon=0),
+            "horizon of PushPast is 0",
+        ),
         (lambda: Task("PushPast", NEAR, FAR, obstacles=[]), "tuples"),  # type: ignore[arg-type]
     ],
 )

@@ -120,6 +120,28 @@ def test_k_outside_the_horizon_is_refused(predictor: GoalPredictor, k: int) -> N
         predictor.predict(np.zeros((1, 3)), np.zeros((1, 3)), np.array([k]))
 
 
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"k": [2.5]}, r"k must hold whole numbers, got 2\.5 in it"),
+        ({"k": [np.nan]}, "k must hold finite numbers"),
+        ({"k": [True]}, "k must hold finite numbers"),
+        ({"start": [[0.0, np.nan, 0.0]]}, "start must hold finite numbers"),
+        ({"goal": [[0.0, 0.0, np.inf]]}, "goal must hold finite numbers"),
+    ],
+)
+def test_what_nothing_can_be_imagined_from_is_refused(
+    predictor: GoalPredictor, change: dict[str, Any], sentence: str
+) -> None:
+    query = {"start": np.zeros((1, 3)), "goal": np.zeros((1, 3)), "k": [3]}
+    with pytest.raises(ValueError, match=sentence):
+        predictor.predict(**{**query, **change})  # type: ignore[arg-type]
+    whole = predictor.predict(np.zeros((1, 3)), np.zeros((1, 3)), np.array([3]))
+    same = predictor.predict(np.zeros((1, 3)), np.zeros((1, 3)), np.array([3.0]))
+    np.testing.assert_array_equal(whole, same)
+    assert predictor.predict(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)).shape == (0, 3)
+
+
 def test_wrong_shapes_are_refused(predictor: GoalPredictor) -> None:
     with pytest.raises(ValueError, match="shapes"):
         predictor.predict(np.zeros((2, 3)), np.zeros((1, 3)), np.array([1, 1]))

@@ -347,7 +347,7 @@ def test_half_a_file_and_bad_fits_are_refused(tmp_path: Path, trained: HerDDPG) 
     with pytest.raises(ValueError, match="not a whole checkpoint"):
         ObjectNetworks.load(tmp_path / "networks")
     for bad in ({"hidden": ()}, {"updates": 0}, {"learning_rate": 0.0}):
-        with pytest.raises(ValueError, match="inverse_fit: hidden"):
+        with pytest.raises(ValueError, match=r"inverse_fit: (hidden|updates|learning_rate) "):
             ObjectNetworks.learned(trained, "toy", "none", **bad)  # type: ignore[arg-type]
 
 

@@ -35,7 +35,8 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def one_test(file: str, n_envs: int) -> int:
     """Steps after which a file's curriculum has had one test, and a cycle could print it."""
-    entry = yaml.safe_load((CONFIGS / file).read_text())[TASK]
+    entries = yaml.safe_load((CONFIGS / file).read_text())
+    entry = entries.get(TASK, entries["default"])  # as rl_zoo3 looks it up
     (options,) = entry["callback"][0].values()
     return (options["every"] * n_envs + options["n_episodes"]) * HORIZON + 1
 
@@ -96,9 +97,8 @@ def test_her_ddpg_trains_and_plays(method: str, n_envs: int, cache: Path, tmp_pa
 
 def test_ddpg_file_has_every_task_with_its_horizon() -> None:
     entries = yaml.safe_load((CONFIGS / "ddpg.yml").read_text())
-    assert set(entries) == {f"FollowObject/{name}-v0" for name in TASKS}
     for name, task in TASKS.items():
-        entry = entries[f"FollowObject/{name}-v0"]
+        entry = entries.get(f"FollowObject/{name}-v0", entries["default"])
         assert entry["train_freq"] == task.horizon
         assert entry["gamma"] == pytest.approx(1.0 - 1.0 / task.horizon)
 

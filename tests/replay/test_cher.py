@@ -154,8 +154,8 @@ def test_weight_survives_a_resume() -> None:
 @pytest.mark.parametrize(
     ("cher", "sentence"),
     [
-        ({"candidates": 0}, "candidates .0. and picks .3. must be >= 1"),
-        ({"growth": 0.5}, "growth .0.5. >= 1"),
+        ({"candidates": 0}, "cher: candidates is 0; it must be at least 1"),
+        ({"growth": 0.5}, "growth is 0.5; it must lie in"),
         ({"lambda": 1}, "cher has no setting 'lambda'"),
     ],
 )

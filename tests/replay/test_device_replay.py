@@ -168,7 +168,7 @@ def test_what_needs_the_host_is_refused_in_a_sentence() -> None:
     imagining = ImaginedGoalVecEnv(make_env(), StraightPredictor(), Curriculum(HORIZON))
     with pytest.raises(ValueError, match="has no imagined_ratio > 0"):
         mirror(make_buffer(imagining, imagined_ratio=0.1))
-    with pytest.raises(ValueError, match="replay_on_device is 'yes'"):
+    with pytest.raises(ValueError, match="replay_on_device must be true or false, not 'yes'"):
         make_model(replay_on_device="yes")
     env = make_env()
     buffer = make_buffer(env)

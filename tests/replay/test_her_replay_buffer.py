@@ -155,9 +155,9 @@ def test_imagined_ratio_needs_the_wrapper() -> None:
         make_buffer(make_env(), imagined_ratio=0.1)
     with pytest.raises(ValueError, match="must lie in"):
         make_buffer(make_env(), moved_ratio=1.5)
-    with pytest.raises(ValueError, match="moved_priority is 'speed'"):
+    with pytest.raises(ValueError, match=r"moved_priority must be .*, not 'speed'"):
         make_buffer(make_env(), moved_priority="speed")
-    with pytest.raises(ValueError, match="must be >= 0 metres"):
+    with pytest.raises(ValueError, match=r"min_goal_distance is -0\.05; it must lie in .* metres"):
         make_buffer(make_env(), min_goal_distance=-0.05)
 
 

@@ -1,0 +1,108 @@
+"""Settings of the curriculum, its tests, and the three stages around what learns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from .fields import Flag, Group, Number, Whole, setting
+from .learning import AlgorithmSettings, InverseSettings, PredictorSettings
+
+COPIES, THREADS = 4096, 1024  # what is more would fill the memory
+
+
+@dataclass(frozen=True)
+class CurriculumSettings(Group):
+    """Which goal an episode shows."""
+
+    title = "`curriculum`, of `Curriculum`"
+    p: Annotated[Number, setting("probability of the original goal", ge=0, le=1)] = 0.2
+    threshold: Annotated[Number, setting("success rate at k_max that raises k_max", ge=0, le=1)] = (
+        0.25
+    )
+    finish_threshold: Annotated[
+        Number,
+        setting("success rate at the last level that ends the curriculum; 0, none", ge=0, le=1),
+    ] = 0.0
+    k_max: Annotated[Whole, setting("first value of k_max, at most the number of levels", ge=1)] = 2
+    levels: Annotated[
+        Literal["time", "path"], setting("whether levels are time-steps or shares of the path")
+    ] = "time"
+    n_levels: Annotated[
+        Whole, setting('how many there are with levels "path"; "time" has T', ge=1, le=10_000)
+    ] = 25
+    sampling: Annotated[
+        Literal["uniform", "max"], setting("whether levels are drawn from 1..k_max, or k_max taken")
+    ] = "uniform"
+    min_distance: Annotated[
+        Number,
+        setting("imagined goals nearer to the start are not shown", unit="metres", ge=0),
+    ] = 0.0
+
+
+@dataclass(frozen=True)
+class CurriculumTestSettings(Group):
+    """The tests of h_max (`CurriculumCallback`)."""
+
+    title = "Of the tests at h_max (`CurriculumCallback`)"
+    n_episodes: Annotated[
+        Whole | None, setting("episodes of a test", none="one of every copy", ge=1)
+    ] = None
+    every: Annotated[Whole, setting("cycles between two tests", ge=1)] = 1
+    store: Annotated[Flag, setting("whether the tests enter the replay buffer")] = True
+
+
+@dataclass(frozen=True)
+class StageSettings(Group):
+    """The three stages (`FollowObject`)."""
+
+    title = "Of the three stages (`FollowObject`)"
+    imagine: Annotated[Flag, setting("whether the robot is shown imagined goals", data=False)] = (
+        True
+    )
+    n_envs: Annotated[Whole, setting("copies of the robot's environment", ge=1, le=COPIES)] = 16
+    n_threads: Annotated[
+        Whole | None,
+        setting("of the simulation; changes no result", none="as many as cores", ge=1, le=THREADS),
+    ] = None
+    reward_type: Annotated[
+        Literal["sparse", "dense"], setting("whether -1 or 0 is paid, or the distance")
+    ] = "sparse"
+    algorithm: Annotated[
+        dict[str, Any] | None,
+        setting("of the robot's algorithm", none="{}", group=AlgorithmSettings, data=False),
+    ] = None
+    curriculum: Annotated[
+        dict[str, Any] | None,
+        setting("which goals are shown", none="{}", group=CurriculumSettings),
+    ] = None
+    object_algorithm: Annotated[
+        dict[str, Any] | None,
+        setting(
+            "of the object's algorithm", none="{}", group=AlgorithmSettings, without=("policy",)
+        ),
+    ] = None
+    object_on_table: Annotated[
+        Flag | None, setting("whether the object stays on the table", none="in Push tasks")
+    ] = None
+    object_n_envs: Annotated[
+        Whole, setting("copies of the object's environment", ge=1, le=COPIES)
+    ] = 16
+    object_timesteps: Annotated[
+        Whole, setting("env steps after which the object's stage gives up", ge=1)
+    ] = 400_000
+    n_paths: Annotated[Whole, setting("object paths that F_phi is fitted on", ge=2, le=10**6)] = 512
+    predictor_fit: Annotated[
+        dict[str, Any] | None, setting("of F_phi", none="{}", group=PredictorSettings)
+    ] = None
+    inverse_fit: Annotated[
+        dict[str, Any] | None,
+        setting("of SLDR's inverse model", none="{}", group=InverseSettings),
+    ] = None
+    test_every: Annotated[
+        Whole, setting("rollouts of every copy between two tests at h_max", ge=1)
+    ] = 4
+    n_test_episodes: Annotated[
+        Whole | None, setting("episodes of such a test", none="`n_envs`", ge=1)
+    ] = None
+    store_tests: Annotated[Flag, setting("whether they enter the replay buffer")] = True
