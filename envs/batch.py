@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from .physics_engine import mujoco
 from .scene import N_SUBSTEPS, OBJECT, TUBE, Scene, weld_targets
 
 _LOGGER = logging.getLogger("sb3_follow_object")

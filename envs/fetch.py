@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles, rotate
 from .faces import BatchVecEnv, RewardType, SingleEnv
+from .physics_engine import mujoco
 from .scene import FINGER_JOINTS, GRIP_SITE, Scene, fetch_scene
 from .task_table import find_task, task_of
 from .tasks import Task

@@ -14,7 +14,7 @@ from ..common.extras import need
 from ..common.files import atomic_write
 from ..ddpg.actor_files import load_actor
 from ..envs import IDS
-from ..envs.picture import open_graphics
+from ..envs.graphics import find_graphics
 from ..imagination.goal_predictor import GoalPredictor
 
 # Episodes side by side in the picture of imagined goals.
@@ -124,21 +124,22 @@ def record(
 def _make(env_id: str, **options: Any) -> gym.Env:
     if env_id in IDS:
         return gym.make(env_id, render_mode="rgb_array", **options)
-    _name_graphics_library()
+    if sys.platform == "linux":
+        # Gymnasium's renderer takes the name as it stands, and without one tries a window first,
+        # which ends a process without a screen.
+        os.environ["MUJOCO_GL"] = find_graphics()
     return gym.make(env_id, render_mode="rgb_array")
 
 
-def _name_graphics_library() -> None:
-    """Spare gymnasium's renderer its first try, a window, which ends a process without a screen."""
-    if sys.platform != "linux" or {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
-        return
-    library, context = open_graphics(8)
-    context.free()
-    os.environ["MUJOCO_GL"] = library
-
-
 def _frame(env: gym.Env) -> np.ndarray:
-    return np.asarray(env.render(), dtype=np.uint8)
+    try:
+        return np.asarray(env.render(), dtype=np.uint8)
+    except (RuntimeError, ValueError):
+        raise
+    except Exception as error:  # graphics libraries, and somebody's environment, raise anything
+        raise RuntimeError(
+            f"the task cannot be drawn here: {type(error).__name__}: {error}"
+        ) from error
 
 
 def _write_png(out: str | os.PathLike[str], image: np.ndarray) -> None:
