@@ -16,6 +16,8 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
+from ..common.reports import reason
+
 _LOGGER = logging.getLogger("sb3_follow_object")
 WINDOWS = "glfw"  # the library that opens windows, and draws where there is a screen
 _OFF_SCREEN = ("egl", "osmesa")
@@ -64,7 +66,7 @@ def open_graphics(size: int) -> tuple[str, Any]:
     except Exception as error:  # each library fails with errors of its own
         forget_opengl(platform)
         raise RuntimeError(
-            f"{library} draws in a process of its own, but not in this one ({_line(error)}); "
+            f"{library} draws in a process of its own, but not in this one ({reason(error)}); "
             "another OpenGL library may be loaded here already."
         ) from error
 
@@ -80,40 +82,42 @@ def find_graphics() -> str:
     if named in _FORBIDDEN:
         raise RuntimeError(f"MUJOCO_GL={given} switches drawing off; unset it to draw.")
     if named not in _UNDECIDED:
-        library = _OTHER_NAMES.get(named, named)
-        reason = why_not(library)
-        if reason is None:
-            return library
-        rest = [other for other in _candidates() if other != library]
-        working = next((other for other in rest if why_not(other) is None), None)
-        way_out = "no other library does either"
-        if working is not None:
-            way_out = f"{working} does: set MUJOCO_GL={working} or unset it"
-        raise RuntimeError(f"MUJOCO_GL={given} does not draw here ({reason}); {way_out}.")
-
-    reasons: dict[str, str] = {}
+        return _named_library(given, _OTHER_NAMES.get(named, named))
+    failed: dict[str, str] = {}
     for library in _candidates():
-        reason = why_not(library)
-        if reason is None:
-            for failed, why in reasons.items():
-                _note_once(f"{failed} does not draw here ({why}); drawing with {library}")
+        why = why_not(library)
+        if why is None:
+            for other, its in failed.items():
+                _note_once(f"{other} does not draw here ({its}); drawing with {library}")
             return library
-        reasons[library] = reason
-    listed = "; ".join(f"{library}: {reason}" for library, reason in reasons.items())
+        failed[library] = why
+    listed = "; ".join(f"{library}: {why}" for library, why in failed.items())
     raise RuntimeError(
         f"There is no OpenGL to draw with ({listed}); "
         "install libegl1 and libegl-mesa0, or libosmesa6."
     )
 
 
+def _named_library(given: str, library: str) -> str:
+    why = why_not(library)
+    if why is None:
+        return library
+    others = (other for other in _candidates() if other != library)
+    working = next((other for other in others if why_not(other) is None), None)
+    way_out = "no other library does either"
+    if working is not None:
+        way_out = f"{working} does: set MUJOCO_GL={working} or unset it"
+    raise RuntimeError(f"MUJOCO_GL={given} does not draw here ({why}); {way_out}.")
+
+
 def check_windows() -> None:
     """Raise a RuntimeError unless a window can be opened: one without a screen ends the process."""
     if sys.platform != "linux":
         return
-    reason = why_not(WINDOWS)
-    if reason is not None:
+    why = why_not(WINDOWS)
+    if why is not None:
         raise RuntimeError(
-            f"No window can be opened here ({reason}); use render_mode='rgb_array', or a screen."
+            f"No window can be opened here ({why}); use render_mode='rgb_array', or a screen."
         )
 
 
@@ -146,7 +150,7 @@ def _try(library: str, surroundings: tuple[str | None, ...]) -> str | None:
     except subprocess.TimeoutExpired:
         return f"it has drawn nothing in {_TRIAL_SECONDS:.0f} s"
     except OSError as error:
-        return f"it cannot be tried: {_line(error)}"
+        return f"it cannot be tried: {reason(error)}"
     if trial.returncode == 0:
         return None
     lines = [line.strip() for line in trial.stderr.splitlines() if line.strip()]
@@ -185,7 +189,3 @@ def forget_opengl(platform: str | None) -> None:
     for name in list(sys.modules):
         if name.partition(".")[0] == "OpenGL" or name.startswith(("mujoco.egl", "mujoco.osmesa")):
             del sys.modules[name]
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

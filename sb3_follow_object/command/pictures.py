@@ -101,6 +101,7 @@ def record(
     # The writer knows the format by the ending; a name of its own keeps half a video apart.
     temporary = out.with_name(f".{out.stem}.{os.getpid()}.mp4")
     try:
+        _check_can_write(temporary, out)
         actor, _ = load_actor(policy_file, env.observation_space, env.action_space)  # type: ignore[arg-type]
         successes = 0
         with imageio.get_writer(temporary, fps=env.metadata.get("render_fps", 25)) as video:
@@ -140,6 +141,15 @@ def _frame(env: gym.Env) -> np.ndarray:
         raise RuntimeError(
             f"the task cannot be drawn here: {type(error).__name__}: {error}"
         ) from error
+
+
+def _check_can_write(temporary: Path, out: Path) -> None:
+    """Raise the OSError that a whole film later would say the encoder had ended."""
+    try:
+        temporary.touch()
+    except OSError as error:
+        error.filename = str(out)
+        raise
 
 
 def _write_png(out: str | os.PathLike[str], image: np.ndarray) -> None:
