@@ -146,6 +146,17 @@ class BatchedSimulation:
         for row, view in self._views[index]:
             row[...] = view
 
+    def physics(self, index: int) -> np.ndarray:
+        """What the physics of one copy goes on from, as mujoco counts it."""
+        state = np.empty(mujoco.mj_stateSize(self.scene.model, STATE))
+        mujoco.mj_getState(self.scene.model, self.data[index], state, STATE)
+        return state
+
+    def take_in(self, index: int) -> None:
+        """Read one copy anew, whose state somebody else has written."""
+        mujoco.mj_forward(self.scene.model, self.data[index])
+        self.refresh(index)
+
     def close(self) -> None:
         """Let the threads go."""
         if self._pool is not None:
