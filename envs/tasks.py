@@ -90,7 +90,7 @@ class Landmarks:
     rest_height: float
 
 
-# What all tasks' scenes share, as they are set up (a test measures it there), in metres.
+# What all tasks' scenes share once they are set up, in metres; a test measures it, to 1 mm, there.
 COMMON = Landmarks(gripper=(1.3419, 0.7491, 0.5347), table=(1.3, 0.75, 0.2), rest_height=0.4249)
 TABLE_HALF_SIZE = (0.25, 0.35)
 SHOULDER = (0.7245, 0.7441, 0.7273)
