@@ -72,8 +72,6 @@ def _sentence(error: Exception) -> str:
     """Say in one line what went wrong."""
     if isinstance(error, MemoryError):
         return f"there is not enough memory ({error})"
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.strerror}: {error.filename}"
     return reason(error)
 
 

@@ -9,7 +9,10 @@ Report = Callable[[str], None]
 
 def reason(error: BaseException) -> str:
     """Return what an error says, in one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = error.strerror if error.filename is None else f"{error.strerror}: {error.filename}"
+    return " ".join(text.split()) or type(error).__name__
 
 
 class Trouble(str):

@@ -153,6 +153,9 @@ def _robot_stage(
     run.report(f"the robot of {config.env_id} learns")
     model = run.prepare()
     model.update_threads = config.torch_threads
+    asked = (config.settings.get("algorithm") or {}).get("device") or "auto"
+    if asked != "auto" and th.device(asked).type != model.device.type:
+        run.report(Trouble(f"there is no device {asked!r} here: the robot learns on the CPU"))
     eval_env = evaluation_env(config.env_id, n_threads=run.settings["n_threads"])
     evaluation = OriginalGoalEvalCallback(
         eval_env,

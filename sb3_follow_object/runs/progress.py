@@ -15,6 +15,7 @@ from ..common.reports import Trouble
 
 # Seconds between two lines where there is no terminal to draw a bar on.
 _LINE_EVERY = 60.0
+_LEAST_WIDTH, _USUAL_WIDTH = 20, 80  # letters
 
 
 class Terminal(Console):
@@ -22,6 +23,11 @@ class Terminal(Console):
 
     What must go on without a reader uses `tell`.
     """
+
+    def __init__(self, **options: Any):
+        super().__init__(**options)
+        if self.width < _LEAST_WIDTH:  # a COLUMNS that no terminal has
+            self.width = _USUAL_WIDTH
 
     def on_broken_pipe(self) -> None:
         """Called where nobody reads any more."""
