@@ -125,7 +125,10 @@ def why_not(library: str) -> str | None:
     """Why a library does not draw here; None if it does. Found out once in a process."""
     if not library.isidentifier():
         return "it is no library of mujoco's"
-    return _try(library, tuple(os.environ.get(name) for name in _SURROUNDINGS))
+    try:
+        return _try(library, tuple(os.environ.get(name) for name in _SURROUNDINGS))
+    except OSError as error:  # of this moment, and not kept
+        return f"it cannot be tried: {reason(error)}"
 
 
 @cache
@@ -149,8 +152,6 @@ def _try(library: str, surroundings: tuple[str | None, ...]) -> str | None:
         )
     except subprocess.TimeoutExpired:
         return f"it has drawn nothing in {_TRIAL_SECONDS:.0f} s"
-    except OSError as error:
-        return f"it cannot be tried: {reason(error)}"
     if trial.returncode == 0:
         return None
     lines = [line.strip() for line in trial.stderr.splitlines() if line.strip()]

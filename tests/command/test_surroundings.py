@@ -114,7 +114,7 @@ def test_odd_terminals_and_homes_show_the_same_table(
     status, out, _ = command(*words, MUJOCO_GL="off", **variables)
     assert status == 0 and holds(folder) == {"curve.png"}
     (row,) = (line for line in out.splitlines() if "0.000 of 8" in line)
-    assert row[1:-1].split()[:2] == ["PushSideGap", row[1]] and " her " in row
+    assert row[1:].split()[::2][:3] == ["PushSideGap", "her", "0"]
     assert "is finished already" in out
 
 
@@ -170,8 +170,7 @@ def test_a_read_only_run_is_tested_and_never_written(
         printed = capsys.readouterr()
         assert printed.out.count('"success_rate": 0.0') == 2
         assert printed.err == (
-            f"sb3-follow-object: the figure is not kept in {folder}: "
-            f"Permission denied: {folder}/cross_tests.json\n"
+            f"sb3-follow-object: the figure is not kept in {folder}: Permission denied\n"
         )
         for words, name in ((["watch"], "video.mp4"), (["plot"], "curve.png")):
             assert main([*words, str(folder)]) == 2
@@ -183,12 +182,15 @@ def test_a_read_only_run_is_tested_and_never_written(
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_a_read_only_run_is_filmed_and_drawn_elsewhere(run: Path, tmp_path: Path) -> None:
-    with read_only_copy(run) as folder:
-        status, _, err = command("watch", folder, "--episodes", 1, "--out", tmp_path / "v.mp4")
-        assert status == 0, err
-        status, _, err = command("plot", folder, "--out", tmp_path / "c.png")
-        assert status == 0, err
+def test_a_run_is_filmed_and_drawn_elsewhere_without_a_write(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (run, *run.rglob("*"))}
+    film, curve = tmp_path / "film.mp4", tmp_path / "curve.png"
+    assert main(["watch", str(run), "--episodes", "1", "--out", str(film)]) == 0
+    assert main(["plot", str(run), "--out", str(curve)]) == 0
+    assert film.exists() and curve.exists()
+    assert {path: path.stat().st_mtime_ns for path in (run, *run.rglob("*"))} == before
 
 
 # Libraries that are there and do not work

@@ -169,6 +169,17 @@ def test_a_library_is_tried_once_while_nothing_around_it_changes(
 
 
 @pytest.mark.usefixtures("fresh_trials")
+def test_a_trial_that_could_not_be_made_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "executable", "/no/such/python")
+        assert graphics.why_not("egl") == "it cannot be tried: No such file or directory: " + (
+            "/no/such/python"
+        )
+    monkeypatch.setattr(graphics, "_TRIAL", "")
+    assert graphics.why_not("egl") is None
+
+
+@pytest.mark.usefixtures("fresh_trials")
 def test_what_an_import_that_failed_left_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(name: str) -> None:
         os.environ["PYOPENGL_PLATFORM"] = "egl"
