@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from ..common.numbers import checked_whole
+from .physics_engine import mujoco
 from .scene import N_SUBSTEPS, OBJECT, TUBE, Scene, weld_targets
 
 _LOGGER = logging.getLogger("sb3_follow_object")
@@ -144,6 +144,17 @@ class BatchedSimulation:
         """Read one copy into the arrays of the batch."""
         for row, view in self._views[index]:
             row[...] = view
+
+    def physics(self, index: int) -> np.ndarray:
+        """What the physics of one copy goes on from, as mujoco counts it."""
+        state = np.empty(mujoco.mj_stateSize(self.scene.model, STATE))
+        mujoco.mj_getState(self.scene.model, self.data[index], state, STATE)
+        return state
+
+    def take_in(self, index: int) -> None:
+        """Read one copy anew, whose state somebody else has written."""
+        mujoco.mj_forward(self.scene.model, self.data[index])
+        self.refresh(index)
 
     def close(self) -> None:
         """Let the threads go."""

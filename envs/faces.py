@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from gymnasium.utils import seeding
 from stable_baselines3.common.vec_env import VecEnv
 
 from .batch import BatchedSimulation
+from .physics_engine import mujoco
 from .picture import Picture
 from .scene import Scene
 from .tasks import SUCCESS_DISTANCE
@@ -46,6 +48,19 @@ class _GoalFace:
         self.reward_type = reward_type
         self.render_mode = render_mode
         self._picture = Picture(simulation.scene, show_regions)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The physics, shared by every environment of the task in this process; not to be written.
+
+        What is only seen is left out of it.
+        """
+        return self.simulation.scene.model
+
+    @property
+    def dt(self) -> float:
+        """Seconds in a step."""
+        return self.simulation.dt
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
         """Rewards (...) of achieved goals (..., 3) for desired ones (..., 3).
@@ -82,6 +97,15 @@ class SingleEnv(_GoalFace, gym.Env):
     ) -> None:
         self._start(self.simulation_type(scene, 1), reward_type, render_mode, show_regions)
         self.observation_space, self.action_space = _spaces(self.simulation)
+        # What the physics was when the data that was handed out was last left to its reader.
+        self._left: np.ndarray | None = None
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """The state of the physics; what is written into it counts from the next step on."""
+        if self._left is None:
+            self._left = self.simulation.physics(0)
+        return self.simulation.data[0]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -89,6 +113,8 @@ class SingleEnv(_GoalFace, gym.Env):
         """Draw object and goal and start an episode; `options` is unused."""
         super().reset(seed=seed)
         self.simulation.reset(0, self.np_random)
+        if self._left is not None:
+            self._left = self.simulation.physics(0)
         if self.render_mode == "human":
             self.render()
         return self._observation(), {}
@@ -107,7 +133,13 @@ class SingleEnv(_GoalFace, gym.Env):
         action = np.asarray(action)
         if action.shape != self.action_space.shape:
             raise ValueError(f"The action has shape {action.shape}, not {self.action_space.shape}.")
-        self.simulation.step(action[None])
+        if self._left is None:
+            self.simulation.step(action[None])
+        else:
+            if not np.array_equal(self._left, self.simulation.physics(0)):
+                self.simulation.take_in(0)
+            self.simulation.step(action[None])
+            self._left = self.simulation.physics(0)
         obs = self._observation()
         if self.render_mode == "human":
             self.render()
@@ -155,7 +187,7 @@ class SingleEnv(_GoalFace, gym.Env):
 
 
 class BatchVecEnv(_GoalFace, VecEnv):
-    """A batch of N as an SB3 VecEnv that resets by itself and truncates at the task's T."""
+    """A batch of N as an SB3 VecEnv that resets by itself and truncates at T."""
 
     metadata = METADATA
 
@@ -169,12 +201,18 @@ class BatchVecEnv(_GoalFace, VecEnv):
         reward_type: RewardType,
         render_mode: str | None,
         show_regions: bool,
+        max_episode_steps: int | None,
     ) -> None:
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(
+                f"max_episode_steps is {max_episode_steps}; copies that are stepped together need "
+                "episodes of at least 1 step."
+            )
         simulation = self.simulation_type(scene, n_envs, n_threads)
         self._start(simulation, reward_type, render_mode, show_regions)
         super().__init__(n_envs, *_spaces(simulation))
         self.metadata = METADATA  # the line above has left out the frames a second
-        self.horizon = scene.task.horizon
+        self.horizon = scene.task.horizon if max_episode_steps is None else int(max_episode_steps)
         self._generators = [seeding.np_random()[0] for _ in range(n_envs)]
         self._actions = np.zeros((n_envs, simulation.action_size))
         if seed is not None:
@@ -185,7 +223,16 @@ class BatchVecEnv(_GoalFace, VecEnv):
         """Gymnasium's spec of each copy, which says how long its episodes are."""
         scene = self.simulation.scene
         env_id = f"FollowObject/{scene.task.name}{'Object' if scene.alone else ''}-v0"
-        return gym.registry.get(env_id) or EnvSpec(env_id, max_episode_steps=scene.task.horizon)
+        spec = gym.registry.get(env_id) or EnvSpec(env_id, max_episode_steps=scene.task.horizon)
+        if spec.max_episode_steps != self.horizon:
+            spec = copy.copy(spec)
+            spec.max_episode_steps = self.horizon
+        return spec
+
+    @property
+    def data(self) -> list[mujoco.MjData]:
+        """The states of the physics of all copies; to be read, not to be written."""
+        return self.simulation.data
 
     def reset(self) -> dict[str, np.ndarray]:
         """Start an episode in every copy; seeds set by `seed()` count from here."""
@@ -270,9 +317,9 @@ class BatchVecEnv(_GoalFace, VecEnv):
         return super().render(mode)
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The attribute, which all copies share, once for each index."""
+        """The attribute, which all copies share but for their `data`, once for each index."""
         value = getattr(self, attr_name)
-        return [value for _ in self._get_indices(indices)]
+        return [value[i] if attr_name == "data" else value for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute, which all copies share.

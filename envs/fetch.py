@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles, rotate
 from .faces import BatchVecEnv, RewardType, SingleEnv
+from .physics_engine import mujoco
 from .scene import FINGER_JOINTS, GRIP_SITE, Scene, fetch_scene
 from .task_table import find_task, task_of
 from .tasks import Task
@@ -141,6 +141,7 @@ class FetchVecEnv(BatchVecEnv):
         n_threads: threads that step them; None takes one a processor.
         seed: copy i draws what `FetchEnv.reset(seed=seed + i)` draws; None is random.
         reward_type, collision, render_mode, show_regions: as in `FetchEnv`.
+        max_episode_steps: T; None is the task's.
 
     Raises:
         ValueError: an unknown id or option, or a number below 1.
@@ -159,6 +160,7 @@ class FetchVecEnv(BatchVecEnv):
         collision: str = "reachable",
         render_mode: str | None = None,
         show_regions: bool = False,
+        max_episode_steps: int | None = None,
     ) -> None:
         scene = fetch_scene(task_of(env_id, alone=False), collision)
         super().__init__(
@@ -169,4 +171,5 @@ class FetchVecEnv(BatchVecEnv):
             reward_type=reward_type,
             render_mode=render_mode,
             show_regions=show_regions,
+            max_episode_steps=max_episode_steps,
         )

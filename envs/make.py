@@ -24,7 +24,8 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
         env_id: any gymnasium id.
         n_envs: number of copies, at least 1.
         n_threads: for our ids, threads that step them; None takes one a processor.
-        options: keywords of `FetchVecEnv`, `ObjectVecEnv` or `gymnasium.make`; `seed` for all.
+        options: keywords of `FetchVecEnv`, `ObjectVecEnv` or `gymnasium.make`; `seed` and
+            `max_episode_steps` for all.
 
     Raises:
         ValueError: the id is unknown, an option is wrong or a count is below 1.

@@ -86,6 +86,7 @@ class ObjectVecEnv(BatchVecEnv):
         n_threads: threads that step them; None takes one a processor.
         seed: copy i draws what `ObjectEnv.reset(seed=seed + i)` draws; None is random.
         on_table, reward_type, render_mode, show_regions: as in `ObjectEnv`.
+        max_episode_steps: T; None is the task's.
 
     Raises:
         ValueError: an unknown id or option, or a number below 1.
@@ -105,6 +106,7 @@ class ObjectVecEnv(BatchVecEnv):
         reward_type: RewardType = "sparse",
         render_mode: str | None = None,
         show_regions: bool = False,
+        max_episode_steps: int | None = None,
     ) -> None:
         super().__init__(
             object_scene(task_of(env_id, alone=True)),
@@ -114,5 +116,6 @@ class ObjectVecEnv(BatchVecEnv):
             reward_type=reward_type,
             render_mode=render_mode,
             show_regions=show_regions,
+            max_episode_steps=max_episode_steps,
         )
         self.simulation.on_table = on_table

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 from importlib import import_module
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from .batch import BatchedSimulation
+from .graphics import check_windows, open_graphics
+from .physics_engine import mujoco
 from .scene import OBJECT, Scene, delete, fetch_spec, object_only
 from .tasks import SUCCESS_DISTANCE, Region, reference_point
 
@@ -121,7 +120,7 @@ class _Canvas:
         self._data = mujoco.MjData(model)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._rectangle = mujoco.MjrRect(0, 0, SIZE, SIZE)
-        self._pen = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        self._pen = _pen(model)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._pen)
         self.scene = mujoco.MjvScene(model, maxgeom=2000)
         _point(self._camera)
@@ -154,13 +153,11 @@ class _Window:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data = model, mujoco.MjData(model)
-        # Without a screen the viewer does not raise: it ends the process.
-        if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-            raise RuntimeError("No window can be opened without a display; use 'rgb_array'.")
+        check_windows()
         running = set(threading.enumerate())
         try:
             self.viewer = import_module("mujoco.viewer").launch_passive(model, self.data)
-        except Exception as error:  # no display, or a library of it is missing
+        except Exception as error:  # mujoco's errors share no class
             raise RuntimeError(f"No window can be opened here ({error}).") from error
         self._threads = set(threading.enumerate()) - running
         _point(self.viewer.cam)
@@ -193,39 +190,11 @@ def _copy_state(
     mujoco.mj_forward(model, data)
 
 
-def open_graphics(size: int) -> tuple[str, Any]:
-    """Name and context of the library in MUJOCO_GL, or else of the first one that works here.
-
-    Args:
-        size: width and height of the context's pictures, pixels.
-
-    Raises:
-        RuntimeError: none works.
-    """
-    named = os.environ.get("MUJOCO_GL")
-    screen = ["glfw"] if "DISPLAY" in os.environ else []
-    platform = os.environ.get("PYOPENGL_PLATFORM")
-    reasons = []
-    for library in [named] if named else [*screen, "egl", "osmesa"]:
-        try:
-            return library, import_module(f"mujoco.{library}").GLContext(size, size)
-        except Exception as error:  # each library fails with errors of its own
-            reasons.append(f"{library}: {error}")
-            _forget_opengl(platform)
-    raise RuntimeError(
-        "There is no OpenGL to draw with; install libegl1 or libosmesa6, or set MUJOCO_GL to "
-        f"the library there is ({'; '.join(reasons)})."
-    )
-
-
-def _forget_opengl(platform: str | None) -> None:
-    """Let the next library be tried: what was imported for one that failed is bound to it."""
-    os.environ.pop("PYOPENGL_PLATFORM", None)
-    if platform is not None:
-        os.environ["PYOPENGL_PLATFORM"] = platform
-    for name in list(sys.modules):
-        if name.partition(".")[0] == "OpenGL" or name.startswith(("mujoco.egl", "mujoco.osmesa")):
-            del sys.modules[name]
+def _pen(model: mujoco.MjModel) -> mujoco.MjrContext:
+    try:
+        return mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    except mujoco.FatalError as error:  # no RuntimeError, though it is one
+        raise RuntimeError(f"The scene cannot be drawn here ({error}).") from error
 
 
 def _point(camera: Any) -> None:

@@ -14,9 +14,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from .physics_engine import mujoco
 from .tasks import Box, Landmarks, Task
 
 N_SUBSTEPS = 20  # of 0.002 s each: one env step is 0.04 s

@@ -92,6 +92,13 @@ class Landmarks:
     rest_height: float
 
 
+# What all tasks' scenes share once they are set up, in metres; a test measures it, to 1 mm, there.
+COMMON = Landmarks(gripper=(1.3419, 0.7491, 0.5347), table=(1.3, 0.75, 0.2), rest_height=0.4249)
+TABLE_HALF_SIZE = (0.25, 0.35)
+SHOULDER = (0.7245, 0.7441, 0.7273)
+REACH = 1.13  # from the shoulder to between the fingers, the arm straight
+
+
 @dataclass(frozen=True)
 class Task:
     """One task as data: obstacles, where object and goal are drawn, and the horizon T.
@@ -108,8 +115,9 @@ class Task:
         min_goal_distance: a goal nearer than this to the object, seen from above, is drawn again.
 
     Raises:
-        ValueError: the name is not made of letters and digits, the horizon is below 1, or
-            there are lists in place of tuples.
+        ValueError: the name is not made of letters and digits, the horizon is below 1, there are
+            lists in place of tuples, goals lie out of the robot's reach, or an object would start
+            beside the table or in an obstacle.
     """
 
     name: str
@@ -131,6 +139,8 @@ class Task:
             hash(self)  # scenes are kept by their tasks
         except TypeError as error:
             raise ValueError(f"{self.name}: give tuples where there are lists.") from error
+        self._check_goals()
+        self._check_starts()
 
     def sample(
         self, rng: np.random.Generator, landmarks: Landmarks
@@ -158,6 +168,36 @@ class Task:
         if rng.random() < self.height.chance:
             z += rng.uniform(self.height.low, self.height.high)
         return start, np.array([goal[0], goal[1], z])
+
+    def _check_goals(self) -> None:
+        reference = reference_point(self.goal, COMMON)
+        low = np.array([*(reference + self.goal.low), COMMON.rest_height])
+        high = np.array([*(reference + self.goal.high), COMMON.rest_height + self.height.high])
+        farthest = np.linalg.norm(np.maximum(np.abs(low - SHOULDER), np.abs(high - SHOULDER)))
+        if farthest > REACH:
+            raise ValueError(
+                f"{self.name}: its goals lie up to {farthest:.2f} m from the robot's shoulder, but "
+                f"its arm reaches {REACH} m."
+            )
+
+    def _check_starts(self) -> None:
+        offset = reference_point(self.start, COMMON) - COMMON.table[:2]
+        low, high = offset + self.start.low, offset + self.start.high  # from the table's centre
+        beyond = np.maximum(-low, high) - TABLE_HALF_SIZE
+        if beyond.max() > 0:
+            raise ValueError(
+                f"{self.name}: its object would start up to {beyond.max():.2f} m beside the table, "
+                f"which ends {TABLE_HALF_SIZE[0]} m in x and {TABLE_HALF_SIZE[1]} m in y from its "
+                "centre."
+            )
+        z = COMMON.rest_height - COMMON.table[2]
+        for box in self.obstacles:
+            centre, half = np.array(box.centre), np.array(box.half_size)
+            apart = (high <= centre[:2] - half[:2]) | (low >= centre[:2] + half[:2])
+            if not apart.any() and abs(z - centre[2]) < half[2]:
+                raise ValueError(
+                    f"{self.name}: its object would start inside the obstacle at {box.centre}."
+                )
 
 
 def reference_point(region: Region, landmarks: Landmarks) -> np.ndarray:

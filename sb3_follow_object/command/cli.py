@@ -12,7 +12,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .cli_options import CURVE, PROGRAM, USER_ERROR, VIDEO, make_parser
+from ..common.reports import Trouble, reason
+from .cli_options import CURVE, IMAGINED, PROGRAM, TASK, USER_ERROR, VIDEO, make_parser
+from .streams import leave_streams, open_streams
 
 # Nothing heavier here: --help must not wait for torch. The commands import what they use.
 
@@ -37,10 +39,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: the arguments after the program's name; by default the process's.
     """
+    open_streams()
+    try:
+        return _run(sys.argv[1:] if argv is None else list(argv))
+    finally:
+        leave_streams()
+
+
+def _run(arguments: list[str]) -> int:
     # Read as PyTorch is imported. Its threads wait for each other less greedily: with the default
     # of 300,000 turns two of them that share a core for a moment hold each other up.
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
-    arguments = sys.argv[1:] if argv is None else list(argv)
     args = make_parser(_COMMANDS).parse_args(arguments)
     args.command_line = shlex.join([PROGRAM, *arguments])
     try:
@@ -63,9 +72,7 @@ def _sentence(error: Exception) -> str:
     """Say in one line what went wrong."""
     if isinstance(error, MemoryError):
         return f"there is not enough memory ({error})"
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.strerror}: {error.filename}"
-    return " ".join(str(error).split())
+    return reason(error)
 
 
 def _train(args: argparse.Namespace) -> None:
@@ -84,41 +91,53 @@ def _train(args: argparse.Namespace) -> None:
             progress=bar.update,
             command=args.command_line,
         )
-        _illustrate(args.run, config, bar.say)
     if not args.quiet:
         row = {name: result[name] for name in ("task", "method", "seed", "k_max")}
         row |= {"env steps": f"{result['env_steps']:,}", "minutes": result["wall_s"] / 60.0}
-        _print_table({**row, "success": f"{result['success_rate']:.3f} of {result['episodes']}"})
+        row["success"] = f"{result['success_rate']:.3f} of {result['episodes']}"
+        try:
+            _print_table(row)
+        except OSError as error:
+            bar.say(Trouble(f"the result is in {args.run}, but not printed: {reason(error)}"))
+    # Last, since no graphics library is to be trusted with a result that nobody has seen.
+    _illustrate(args.run, config, bar.say)
 
 
 def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> None:
     """Draw what a finished run folder has no new picture of; say what could not be drawn."""
-    from ..comparison.plots import draw_curves
-    from ..imagination.goal_predictor import GoalPredictor
     from ..runs.object_stage_files import PREDICTOR
     from ..runs.run_folder import POLICY, RESULT
-    from .pictures import draw_imagined, draw_task, record
 
     env_id = config.env_id
-    makers: dict[str, Callable[[Path], Any]] = {
-        CURVE: lambda out: draw_curves([run], out),
-        "task.png": lambda out: draw_task(env_id, out),
-    }
-    if (run / PREDICTOR).exists():
-        predictor = GoalPredictor.load(run / PREDICTOR, env_id=env_id)
-        makers["imagined.png"] = lambda out: draw_imagined(env_id, predictor, out)
-    makers[VIDEO] = lambda out: record(run / POLICY, env_id, out)
+
+    def draw(name: str) -> None:
+        from ..comparison.plots import draw_curves
+        from ..imagination.goal_predictor import GoalPredictor
+        from .pictures import draw_imagined, draw_task, record
+
+        out = run / name
+        if name == CURVE:
+            draw_curves([run], out)
+        elif name == TASK:
+            draw_task(env_id, out)
+        elif name == IMAGINED:
+            draw_imagined(env_id, GoalPredictor.load(run / PREDICTOR, env_id=env_id), out)
+        else:
+            record(run / POLICY, env_id, out)
+
     failed: dict[str, list[str]] = {}
-    for name, make in makers.items():
-        picture = run / name
-        if picture.exists() and picture.stat().st_mtime >= (run / RESULT).stat().st_mtime:
+    for name in (CURVE, TASK, IMAGINED, VIDEO):
+        if name == IMAGINED and not (run / PREDICTOR).exists():
             continue
         try:
-            make(run / name)
+            picture = run / name
+            if picture.exists() and picture.stat().st_mtime >= (run / RESULT).stat().st_mtime:
+                continue
+            draw(name)
         except Exception as error:  # graphics drivers raise anything; the run itself is done
-            failed.setdefault(" ".join(str(error).split()), []).append(name)
-    for reason, names in failed.items():
-        say(f"left out {', '.join(names)}: {reason}")
+            failed.setdefault(reason(error), []).append(name)
+    for why, names in failed.items():
+        say(f"left out {', '.join(names)}: {why}")
 
 
 def _config(args: argparse.Namespace) -> RunConfig:
@@ -182,7 +201,7 @@ def _evaluate(args: argparse.Namespace) -> None:
     if env_id in (config.env_id, config.full_id):
         rate = evaluate(args.run / POLICY, env_id, args.episodes, seed).success_rate
     else:
-        rate = cross_test(args.run, env_id, args.episodes, seed)
+        rate = cross_test(args.run, env_id, args.episodes, seed, _warn)
     result = {
         "env": env_id,
         "method": config.method,
@@ -195,6 +214,10 @@ def _evaluate(args: argparse.Namespace) -> None:
         print(json.dumps(result))
     else:
         _print_table(result)
+
+
+def _warn(sentence: str) -> None:
+    print(f"{PROGRAM}: {sentence}", file=sys.stderr)
 
 
 def _watch(args: argparse.Namespace) -> None:
@@ -264,7 +287,7 @@ def _compare(args: argparse.Namespace) -> None:
         finally:
             write_report(args.out, display.say)
     if not args.quiet:
-        print((args.out / "table.md").read_text(), end="")
+        print((args.out / "table.md").read_text(encoding="utf-8"), end="")
     if failed:
         raise RuntimeError(f"{len(failed)} of {n_runs} runs failed: {', '.join(failed)}")
 
@@ -291,14 +314,15 @@ def _settings(args: argparse.Namespace) -> None:
 
 def _print_table(row: dict[str, Any]) -> None:
     """Print one result."""
-    from rich.console import Console
     from rich.table import Table
+
+    from ..runs.progress import Terminal
 
     table = Table()
     for name in row:
         table.add_column(name, overflow="fold")  # of names that differ in their last letter only
     table.add_row(*map(_cell, row.values()))
-    Console().print(table)
+    Terminal().print(table)
 
 
 def _cell(value: Any) -> str:
@@ -316,3 +340,6 @@ _COMMANDS = {
     "predictor": _predictor,
     "settings": _settings,
 }
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -15,7 +15,7 @@ from ..settings.methods import METHODS
 
 PROGRAM = "sb3-follow-object"
 USER_ERROR = 2
-CURVE, VIDEO = "curve.png", "video.mp4"
+CURVE, TASK, IMAGINED, VIDEO = "curve.png", "task.png", "imagined.png", "video.mp4"
 
 
 class Parser(argparse.ArgumentParser):

@@ -14,7 +14,7 @@ from ..common.extras import need
 from ..common.files import atomic_write
 from ..ddpg.actor_files import load_actor
 from ..envs import IDS
-from ..envs.picture import open_graphics
+from ..envs.graphics import find_graphics
 from ..imagination.goal_predictor import GoalPredictor
 
 # Episodes side by side in the picture of imagined goals.
@@ -101,6 +101,7 @@ def record(
     # The writer knows the format by the ending; a name of its own keeps half a video apart.
     temporary = out.with_name(f".{out.stem}.{os.getpid()}.mp4")
     try:
+        _check_can_write(temporary, out)
         actor, _ = load_actor(policy_file, env.observation_space, env.action_space)  # type: ignore[arg-type]
         successes = 0
         with imageio.get_writer(temporary, fps=env.metadata.get("render_fps", 25)) as video:
@@ -124,21 +125,31 @@ def record(
 def _make(env_id: str, **options: Any) -> gym.Env:
     if env_id in IDS:
         return gym.make(env_id, render_mode="rgb_array", **options)
-    _name_graphics_library()
+    if sys.platform == "linux":
+        # Gymnasium's renderer takes the name as it stands, and without one tries a window first,
+        # which ends a process without a screen.
+        os.environ["MUJOCO_GL"] = find_graphics()
     return gym.make(env_id, render_mode="rgb_array")
 
 
-def _name_graphics_library() -> None:
-    """Spare gymnasium's renderer its first try, a window, which ends a process without a screen."""
-    if sys.platform != "linux" or {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
-        return
-    library, context = open_graphics(8)
-    context.free()
-    os.environ["MUJOCO_GL"] = library
-
-
 def _frame(env: gym.Env) -> np.ndarray:
-    return np.asarray(env.render(), dtype=np.uint8)
+    try:
+        return np.asarray(env.render(), dtype=np.uint8)
+    except (RuntimeError, ValueError):
+        raise
+    except Exception as error:  # graphics libraries, and somebody's environment, raise anything
+        raise RuntimeError(
+            f"the task cannot be drawn here: {type(error).__name__}: {error}"
+        ) from error
+
+
+def _check_can_write(temporary: Path, out: Path) -> None:
+    """Raise the OSError that a whole film later would say the encoder had ended."""
+    try:
+        temporary.touch()
+    except OSError as error:
+        error.filename = str(out)
+        raise
 
 
 def _write_png(out: str | os.PathLike[str], image: np.ndarray) -> None:

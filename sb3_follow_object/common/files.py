@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 LOCK = ".lock"
+# What file systems without locks say to who asks for one.
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextmanager
@@ -33,8 +36,11 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        with suppress(OSError):  # where nothing can be written there is nothing to remove either
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename == str(temporary):
+            error.filename = str(path)  # the name that whoever asked knows
         raise
     if os.name == "posix":  # the rename itself survives a power cut only once the folder is synced
         folder = os.open(path.parent, os.O_RDONLY)
@@ -60,7 +66,7 @@ def remove_half_written(folder: str | os.PathLike[str]) -> None:
 def lock(folder: str | os.PathLike[str], *, wait: bool) -> Iterator[None]:
     """Hold a folder for one process; the lock ends with the process, however that ends.
 
-    Where there are no such locks (not POSIX) nothing is held.
+    Where there are no such locks (not POSIX, some network file systems) nothing is held.
 
     Args:
         folder: must exist; a file named .lock is made in it.
@@ -81,4 +87,7 @@ def lock(folder: str | os.PathLike[str], *, wait: bool) -> Iterator[None]:
             raise ValueError(
                 f"another process works in {folder}; wait until it ends, or give another folder"
             ) from error
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
         yield

@@ -7,6 +7,14 @@ from collections.abc import Callable
 Report = Callable[[str], None]
 
 
+def reason(error: BaseException) -> str:
+    """Return what an error says, in one line."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = error.strerror if error.filename is None else f"{error.strerror}: {error.filename}"
+    return " ".join(text.split()) or type(error).__name__
+
+
 class Trouble(str):
     """A sentence about what went wrong, which `--quiet` does not silence."""
 

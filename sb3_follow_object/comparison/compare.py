@@ -10,8 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..common.extras import MissingExtra
-from ..common.reports import Trouble
+from ..common.reports import Trouble, reason
 from ..runs.run_folder import POLICY, trained_steps
 from .cross import partner, read_cross_tests
 from .executors import Executor, Message
@@ -226,12 +225,12 @@ def _stop_on_signals(request: Callable[[], None]) -> Iterator[None]:
 
 
 def write_report(folder: Path, say: Callable[[str], None]) -> None:
-    """Write the tables and, where matplotlib is installed, the figures into the results folder."""
+    """Write the tables and, where they can be drawn, the figures into the results folder."""
     from .figures import draw_results
     from .results import read_results, write_tables
 
     write_tables(read_results(folder), folder)
     try:
         draw_results(folder, folder / "figures")
-    except MissingExtra as error:
-        say(f"left out the figures: {error}")
+    except Exception as error:  # of fonts, caches, disks; the tables hold what was measured
+        say(Trouble(f"left out the figures: {reason(error)}"))

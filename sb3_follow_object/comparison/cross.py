@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.files import atomic_write
+from ..common.reports import Report
 from ..envs.goal_envs import check_task
 from ..runs.experiment import evaluate
 from ..runs.run_folder import CROSS_TESTS, POLICY
@@ -24,6 +25,7 @@ def cross_test(
     env_id: str,
     n_episodes: int | None = None,
     seed: int | None = None,
+    report: Report | None = None,
 ) -> float:
     """Test a run's policy on another task, keep the figure in the run's folder and return it.
 
@@ -34,8 +36,10 @@ def cross_test(
         env_id: the other task; its observations, actions and goals must be shaped as the run's.
         n_episodes: >= 1; by default as many as the run's own final test.
         seed: of the episodes; by default the run's.
+        report: called with a sentence where the figure cannot be kept; None raises.
 
     Raises:
+        OSError: the figure cannot be kept, and nobody is told by `report`.
         ValueError: there is no such task, no policy, or it does not fit.
     """
     check_task(env_id)
@@ -47,7 +51,12 @@ def cross_test(
     kept, name = read_cross_tests(run), task_name(env_id)
     if name not in kept or kept[name]["episodes"] <= n_episodes:
         kept[name] = {"success_rate": rate, "episodes": n_episodes}
-        atomic_write(run / CROSS_TESTS, json.dumps(kept, indent=1).encode())
+        try:
+            atomic_write(run / CROSS_TESTS, json.dumps(kept, indent=1).encode())
+        except OSError as error:
+            if report is None:
+                raise
+            report(f"the figure is not kept in {run}: {error.strerror}")
     return rate
 
 

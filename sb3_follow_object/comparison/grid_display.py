@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from typing import Any
 
 from rich.live import Live
@@ -38,15 +39,17 @@ class GridDisplay:
 
     def __enter__(self) -> GridDisplay:
         if self._console.is_terminal:
-            self._live.start()
+            with suppress(OSError):
+                self._live.start()
         return self
 
     def __exit__(self, *raised: object) -> None:
-        self._live.stop()
+        with suppress(OSError):
+            self._live.stop()
 
     def say(self, sentence: str) -> None:
-        """Print a sentence above the table."""
-        self._console.say(sentence)
+        """Print a sentence above the table, while there is somebody to read it."""
+        self._console.tell(sentence)
 
     def expect(self, name: str, total: int, done: int) -> None:
         """Take a cell's env steps, in all and done already, into the estimate."""
@@ -104,7 +107,8 @@ class GridDisplay:
     def refresh(self) -> None:
         """Draw the table anew, or print lines where it is time to."""
         if self._console.is_terminal:
-            self._live.refresh()
+            with suppress(OSError):
+                self._live.refresh()
         elif self._clock() - self._last_lines >= _LINES_EVERY:
             self._last_lines = self._clock()
             self.say(self._title())

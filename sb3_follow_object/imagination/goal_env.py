@@ -23,7 +23,9 @@ def check_horizons(predictor: GoalPredictor, curriculum: Curriculum) -> None:
     if predictor.horizon != curriculum.horizon:
         raise ValueError(
             f"The predictor imagines {predictor.horizon} steps, "
-            f"but the curriculum has horizon {curriculum.horizon}."
+            f"but the curriculum has horizon {curriculum.horizon}: give "
+            f"Curriculum({predictor.horizon}), or an F_phi learned in episodes of "
+            f"{curriculum.horizon} steps (register_task makes a task of that horizon)."
         )
 
 

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from ..callbacks.eval_callback import OriginalGoalEvalCallback
 from ..callbacks.rollout import Episodes, run_episodes
 from ..common.files import atomic_write, lock, remove_half_written
-from ..common.reports import Report, Trouble
+from ..common.reports import Report, Trouble, reason
 from ..common.seeds import stream_seed
 from ..ddpg.actor_files import load_actor
 from ..envs import make_vec
@@ -85,8 +85,10 @@ def train(
     with ExitStack() as stack:
         if resume:
             check_same_run(folder, config)
-            stack.enter_context(lock(folder, wait=wait))
             result = finished_result(folder, config)
+            if result is None:  # else nothing is written, also not a lock
+                stack.enter_context(lock(folder, wait=wait))
+                result = finished_result(folder, config)
             if result is not None:
                 report(f"{folder} is finished already")
                 return result
@@ -155,6 +157,9 @@ def _robot_stage(
     run.report(f"the robot of {config.env_id} learns")
     model = run.prepare()
     model.update_threads = config.torch_threads
+    asked = (config.settings.get("algorithm") or {}).get("device") or "auto"
+    if asked != "auto" and th.device(asked).type != model.device.type:
+        run.report(Trouble(f"there is no device {asked!r} here: the robot learns on the CPU"))
     eval_env = evaluation_env(config.env_id, n_threads=run.settings["n_threads"])
     evaluation = OriginalGoalEvalCallback(
         eval_env,
@@ -182,7 +187,7 @@ def _robot_stage(
                 "nothing is left for the robot to learn in"
             )
         )
-    model.set_logger(_logger(folder, run.env_steps))
+    model.set_logger(_logger(folder, run.env_steps, run.report))
     writer = CheckpointCallback(
         checkpoints, keeper.state_dict, lambda: run.env_steps, config.checkpoint_minutes, stop
     )
@@ -308,23 +313,25 @@ def evaluate(
 def _stopped(error: Exception, run: FollowObject, folder: Path) -> RuntimeError:
     """Say in one sentence what happened, and from where the run can go on."""
     named = isinstance(error, (ValueError, RuntimeError, OSError)) and str(error)
-    reason = " ".join((str(error) if named else f"{type(error).__name__}: {error}").split())
+    what = " ".join((str(error) if named else f"{type(error).__name__}: {error}").split())
     kept = checkpoint_files(folder)
     rest = f"from {kept[-1].name}" if kept else "from its beginning"
     return RuntimeError(
-        f"training stopped at {run.env_steps} env steps: {reason}; "
+        f"training stopped at {run.env_steps} env steps: {what}; "
         f"the run in {folder} can be resumed {rest}"
     )
 
 
-def _logger(folder: Path, env_steps: int) -> Logger:
+def _logger(folder: Path, env_steps: int, report: Report) -> Logger:
     """CSV and TensorBoard; a resumed run begins another CSV rather than overwrite the first."""
-    formats = ["csv"]
+    suffix = f"_{env_steps}"
+    formats = [make_output_format("csv", str(folder), suffix)]
     try:
         import tensorboard  # noqa: F401
 
-        formats.append("tensorboard")
-    except ImportError:
+        formats.append(make_output_format("tensorboard", str(folder), suffix))
+    except ModuleNotFoundError:
         pass
-    suffix = f"_{env_steps}"
-    return Logger(str(folder), [make_output_format(f, str(folder), suffix) for f in formats])
+    except Exception as error:  # it drags in much that may not fit together
+        report(Trouble(f"left out the log for TensorBoard: {reason(error)}"))
+    return Logger(str(folder), formats)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 from ..common.files import lock
@@ -20,6 +21,7 @@ from ..settings.run_config import RunConfig
 
 _FILES = (FACTS_FILE, OBJECT_FILE)
 CACHE_VARIABLE = "SB3_FOLLOW_OBJECT_CACHE"
+_SET_THE_VARIABLE = f"set {CACHE_VARIABLE} to a folder that can be written"
 
 
 def get_predictor(
@@ -30,13 +32,13 @@ def get_predictor(
     Args:
         env_id: a task of this package.
         folder: where the predictor is kept; by default a folder for this task and its physics in
-            $SB3_FOLLOW_OBJECT_CACHE or in the user's cache.
+            $SB3_FOLLOW_OBJECT_CACHE or in the user's cache. What is there is read, not written.
         report: called with a sentence now and then while it is learned, which takes minutes.
 
     Raises:
         ValueError: the folder holds a predictor for another task, other physics or another
-            object_on_table, a damaged one, or an object's networks alone; or the id is not of this
-            package.
+            object_on_table, a damaged one, or an object's networks alone; it holds none and cannot
+            be written; or the id is not of this package.
     """
     path = _kept(FACTS_FILE, env_id, folder, report)
     on_table = keeps_object_on_table(env_id)
@@ -58,9 +60,21 @@ def get_object_networks(
 
 def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report: Report) -> Path:
     """Return a file of a task's first two stages, which run unless it is there already."""
-    path = cache_folder() / env_id / physics_id(env_id) if folder is None else Path(folder)
-    path.mkdir(parents=True, exist_ok=True)
-    with lock(path, wait=True):  # those of a SubprocVecEnv come together
+    if folder is None:
+        path = cache_folder() / env_id / physics_id(env_id)
+    else:
+        path = Path(folder).expanduser()
+    if (path / name).exists():  # whole, since files take their names so: reading needs no lock
+        return path / name
+    with ExitStack() as held:
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            held.enter_context(lock(path, wait=True))  # those of a SubprocVecEnv come together
+        except OSError as error:
+            raise ValueError(
+                f"{path} holds no {name} and cannot be written ({error.strerror or error}); "
+                + ("give another folder" if folder is not None else _SET_THE_VARIABLE)
+            ) from error
         if not (path / name).exists():
             other = next((file for file in _FILES if (path / file).exists()), None)
             if folder is not None and other is not None:
@@ -72,7 +86,7 @@ def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report:
 def learn_predictor(
     config: RunConfig, folder: str | os.PathLike[str], report: Report = print
 ) -> GoalPredictor:
-    """Run stages one and two (paper, sections 4.1 and 4.2) and save what they learn in a folder."""
+    """Run stages one and two (paper, sections 4.1 and 4.2) and save what a folder lacks of both."""
     run = FollowObject(
         config.env_id, seed=config.seed, report=report, **{**config.settings, "n_envs": 1}
     )
@@ -81,19 +95,35 @@ def learn_predictor(
     finally:
         run.close()
     assert run.object_stage.networks is not None
-    predictor.save(folder)
-    run.object_stage.networks.save(Path(folder) / OBJECT_FILE)
+    if not (Path(folder) / FACTS_FILE).exists():  # others may be reading it
+        predictor.save(folder)
+    if not (Path(folder) / OBJECT_FILE).exists():
+        run.object_stage.networks.save(Path(folder) / OBJECT_FILE)
     return predictor
 
 
 def cache_folder() -> Path:
-    """Return the folder that predictors are kept in; it need not exist."""
-    if CACHE_VARIABLE in os.environ:
-        return Path(os.environ[CACHE_VARIABLE])
+    """Return the folder that predictors are kept in; it need not exist.
+
+    Raises:
+        ValueError: there is no home folder to find it in.
+    """
+    given = os.environ.get(CACHE_VARIABLE, "")
+    try:
+        if given.strip():
+            return Path(given).expanduser()
+        return _users_cache() / "sb3_follow_object"
+    except RuntimeError as error:
+        where = f"{CACHE_VARIABLE} is {given!r}, but " if given.strip() else ""
+        raise ValueError(
+            f"{where}there is no home folder to keep predictors in; {_SET_THE_VARIABLE}"
+        ) from error
+
+
+def _users_cache() -> Path:
     if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home()))
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "sb3_follow_object"
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home())
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return given if given.is_absolute() else Path.home() / ".cache"  # as its specification says

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import sys
 import time
+from contextlib import suppress
 from typing import Any
 
 from rich.console import Console
@@ -14,10 +15,19 @@ from ..common.reports import Trouble
 
 # Seconds between two lines where there is no terminal to draw a bar on.
 _LINE_EVERY = 60.0
+_LEAST_WIDTH, _USUAL_WIDTH = 20, 80  # letters
 
 
 class Terminal(Console):
-    """A console that reports a reader who has gone as the OSError it is, instead of leaving."""
+    """A console that reports a reader who has gone as the OSError it is, instead of leaving.
+
+    What must go on without a reader uses `tell`.
+    """
+
+    def __init__(self, **options: Any):
+        super().__init__(**options)
+        if self.width < _LEAST_WIDTH:  # a COLUMNS that no terminal has
+            self.width = _USUAL_WIDTH
 
     def on_broken_pipe(self) -> None:
         """Called where nobody reads any more."""
@@ -28,6 +38,13 @@ class Terminal(Console):
         if self.quiet and isinstance(sentence, Trouble):
             print(sentence, file=sys.stderr)
         self.print(sentence, markup=False, highlight=False, soft_wrap=True)
+
+    def tell(self, sentence: str) -> None:
+        """Print a sentence as `say` does, to whom it may reach: a run does not end for its log."""
+        try:
+            self.say(sentence)
+        except (OSError, ValueError):  # gone, full, or closed
+            self.quiet = True
 
 
 class ProgressBar:
@@ -56,15 +73,17 @@ class ProgressBar:
         self._first: tuple[float, int] | None = None
 
     def __enter__(self) -> ProgressBar:
-        self._bar.start()
+        with suppress(OSError):
+            self._bar.start()
         return self
 
     def __exit__(self, *raised: object) -> None:
-        self._bar.stop()
+        with suppress(OSError):
+            self._bar.stop()
 
     def say(self, sentence: str) -> None:
-        """Print a sentence above the bar."""
-        self._console.say(sentence)
+        """Print a sentence above the bar, while there is somebody to read it."""
+        self._console.tell(sentence)
 
     def update(self, figures: dict[str, Any]) -> None:
         """Show the figures that `train` reports after each rollout."""

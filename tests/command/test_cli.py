@@ -242,7 +242,7 @@ def test_pictures_without_the_extras_are_left_out_with_a_sentence(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def missing(module: str) -> None:
-        raise ImportError(module)
+        raise ModuleNotFoundError(module, name=module.partition(".")[0])
 
     folder = tmp_path / "run"
     shutil.copytree(finished, folder, ignore=shutil.ignore_patterns("*.png", "*.mp4"))

@@ -1,9 +1,6 @@
 """The environments as their users meet them: gymnasium's and SB3's protocols, over every id."""
 
-import os
 import pickle
-import sys
-from types import ModuleType
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +17,6 @@ from sb3_follow_object.envs import (
     ObjectVecEnv,
     make_vec,
     physics_id,
-    picture,
     register_envs,
 )
 from sb3_follow_object.envs.scene import fetch_scene
@@ -308,35 +304,3 @@ def test_wrong_options_and_modules_are_refused_in_a_sentence() -> None:
         make_vec("FollowObject/PnPShelf-v0", 1, colour="red")
     with pytest.raises(ValueError, match="names a module that cannot be imported"):
         make_vec("no_such_module:FollowObject/Other-v0", 1)
-
-
-@pytest.mark.parametrize("platform", [None, "wayland"])
-def test_where_one_graphics_library_fails_the_next_is_tried(
-    platform: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first leaves its name in the environment and its modules behind, as EGL's does."""
-    tried = []
-    stale, loaded = ModuleType("OpenGL.platform"), ModuleType("mujoco.osmesa")
-    loaded.GLContext = lambda *size: size  # type: ignore[attr-defined]
-
-    def load(name: str) -> ModuleType:
-        tried.append(name)
-        if name == "mujoco.egl":
-            monkeypatch.setitem(os.environ, "PYOPENGL_PLATFORM", "egl")
-            monkeypatch.setitem(sys.modules, "OpenGL.platform", stale)
-            raise AttributeError("no libEGL")
-        assert sys.modules.get("OpenGL.platform") is not stale
-        return loaded
-
-    for name in ("MUJOCO_GL", "DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
-    if platform is not None:
-        monkeypatch.setenv("PYOPENGL_PLATFORM", platform)
-    # What the test makes this process forget is put back after it.
-    for name in [name for name in sys.modules if name.startswith(("OpenGL", "mujoco.egl"))]:
-        monkeypatch.setitem(sys.modules, name, sys.modules[name])
-    monkeypatch.setattr(picture, "import_module", load)
-    assert picture.open_graphics(8) == ("osmesa", (8, 8))
-    assert tried == ["mujoco.egl", "mujoco.osmesa"]
-    assert os.environ.get("PYOPENGL_PLATFORM") == platform

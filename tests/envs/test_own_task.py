@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from cli_runs import TINY
@@ -22,13 +23,16 @@ from sb3_follow_object.envs import (
     TASKS,
     Box,
     FetchVecEnv,
+    Height,
     Region,
     Task,
     make_vec,
     object_id,
     physics_id,
     register_task,
+    tasks,
 )
+from sb3_follow_object.envs.scene import fetch_scene
 from sb3_follow_object.envs.tasks import Landmarks
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.settings.presets import load_config, run_config
@@ -110,11 +114,46 @@ def test_a_grid_calls_it_by_its_short_name(own: Task, tmp_path: Path) -> None:
             "horizon of PushPast is 0",
         ),
         (lambda: Task("PushPast", NEAR, FAR, obstacles=[]), "tuples"),  # type: ignore[arg-type]
+        (
+            lambda: Task("PushPast", NEAR, Region("gripper", (5.0, 0.0), (5.1, 0.1))),
+            r"PushPast: its goals lie up to 5.73 m from the robot's shoulder, but its arm reaches",
+        ),
+        (lambda: Task("PushPast", NEAR, FAR, Height(0.0, 5.0)), r"goals lie up to 4.7\d m from"),
+        (lambda: Task("PushPast", NEAR, Region("table", (0, 0), (np.inf, 0))), "up to inf m"),
+        (
+            lambda: Task("PushPast", Region("table", (-0.30, 0.0), (0.0, 0.1)), FAR),
+            "would start up to 0.05 m beside the table",
+        ),
+        (
+            lambda: Task("PushPast", NEAR, FAR, obstacles=(Box((0, -0.1, 0.25), (0.1,) * 3),)),
+            r"would start inside the obstacle at \(0, -0.1, 0.25\)",
+        ),
     ],
 )
 def test_a_task_that_cannot_be_is_refused(wrong: Any, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         wrong()
+
+
+def test_reach_and_table_are_those_of_the_scene() -> None:
+    for task in TASKS.values():
+        scene = fetch_scene(task)
+        for name in ("gripper", "table", "rest_height"):
+            measured, said = getattr(scene.landmarks, name), getattr(tasks.COMMON, name)
+            np.testing.assert_allclose(measured, said, atol=1e-3, err_msg=task.name)
+        model, data = scene.model, mujoco.MjData(scene.model)
+        data.qpos[:] = scene.qpos
+        mujoco.mj_forward(model, data)
+        shoulder = model.body("robot0:shoulder_pan_link")
+        np.testing.assert_allclose(data.xpos[shoulder.id], tasks.SHOULDER, atol=1e-4)
+        table = model.geom_size[model.body("table0").geomadr[0]]
+        np.testing.assert_allclose(table[:2], tasks.TABLE_HALF_SIZE)
+        hand = model.body("robot0:gripper_link").id
+        arm = float(np.linalg.norm(data.site("robot0:grip").xpos - data.xpos[hand]))
+        while hand != shoulder.id:
+            arm += float(np.linalg.norm(model.body_pos[hand]))
+            hand = model.body_parentid[hand]
+        assert arm == pytest.approx(tasks.REACH, abs=0.005)
 
 
 def test_regions_without_a_place_for_the_object_are_refused() -> None:

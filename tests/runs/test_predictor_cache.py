@@ -1,0 +1,163 @@
+"""The cache of F_phi: read without a write, made once, and found where its variable says."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from read_only import read_only_copy
+from tiny import TASK, cache_networks, cache_predictor, tiny_networks
+
+from sb3_follow_object.common.files import lock
+from sb3_follow_object.imagination.goal_predictor import GoalPredictor
+from sb3_follow_object.imagination.predictor_files import FACTS_FILE
+from sb3_follow_object.object_stage.networks import FILE as OBJECT_FILE
+from sb3_follow_object.runs import predictor_cache
+from sb3_follow_object.runs.predictor_cache import (
+    CACHE_VARIABLE,
+    cache_folder,
+    get_object_networks,
+    get_predictor,
+)
+
+
+@pytest.fixture
+def never_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*arguments: Any) -> None:
+        raise AssertionError("the object stage was run")
+
+    monkeypatch.setattr(predictor_cache, "learn_predictor", fail)
+
+
+@pytest.mark.usefixtures("never_learned")
+def test_what_a_read_only_cache_holds_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache_predictor(tmp_path)
+    cache_networks(tmp_path)
+    before = {path.name for path in tmp_path.rglob("*")}
+    with read_only_copy(tmp_path) as cache:
+        monkeypatch.setenv(CACHE_VARIABLE, str(cache))
+        assert get_predictor(TASK).env_id == TASK
+        assert get_object_networks(TASK).env_id == TASK
+        (folder,) = (cache / TASK).iterdir()
+        assert get_predictor(TASK, folder).env_id == TASK
+        assert {path.name for path in cache.rglob("*")} == before
+
+
+@pytest.mark.usefixtures("never_learned")
+def test_a_read_only_cache_without_the_file_is_refused_before_anything_is_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache_networks(tmp_path)
+    with read_only_copy(tmp_path) as cache:
+        monkeypatch.setenv(CACHE_VARIABLE, str(cache))
+        for env_id in (TASK, "FollowObject/PnPShelf-v0"):  # a folder is there, and is not
+            with pytest.raises(ValueError) as error:
+                get_predictor(env_id)
+            assert str(error.value).startswith(f"{cache / env_id}/")
+            assert str(error.value).endswith(
+                f"holds no {FACTS_FILE} and cannot be written (Permission denied); "
+                f"set {CACHE_VARIABLE} to a folder that can be written"
+            )
+        with pytest.raises(ValueError, match=r"cannot be written .*; give another folder"):
+            get_predictor(TASK, cache / "mine")
+
+
+def test_makers_that_come_together_learn_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    learned = []
+
+    def learn(config: Any, folder: Path, report: Any) -> None:
+        learned.append(config.env_id)
+        time.sleep(0.3)
+        cache_predictor(tmp_path)
+
+    monkeypatch.setattr(predictor_cache, "learn_predictor", learn)
+    with ThreadPoolExecutor(4) as pool:
+        predictors = list(pool.map(get_predictor, [TASK] * 4))
+    assert learned == [TASK]
+    assert [predictor.env_id for predictor in predictors] == [TASK] * 4
+
+
+def test_learning_what_is_missing_leaves_what_others_may_be_reading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache_predictor(tmp_path)
+    (folder,) = (tmp_path / TASK).iterdir()
+    kept = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    class Stage:
+        networks = tiny_networks()
+
+        def learn_predictor(self, networks: bool) -> GoalPredictor:
+            return GoalPredictor.load(folder)
+
+    class Run:
+        def __init__(self, *arguments: Any, **settings: Any) -> None:
+            self.object_stage = Stage()
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(predictor_cache, "FollowObject", Run)
+    monkeypatch.setattr(GoalPredictor, "save", lambda *arguments: pytest.fail("written over"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    assert get_object_networks(TASK).env_id == TASK
+    assert (folder / OBJECT_FILE).exists()
+    assert {name: (folder / name).read_bytes() for name in kept} == kept
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ("", "home/.cache/sb3_follow_object"),
+        ("  ", "home/.cache/sb3_follow_object"),
+        ("~", "home"),
+        ("~/goals", "home/goals"),
+    ],
+)
+def test_the_variable_is_read_as_a_shell_would(
+    value: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv(CACHE_VARIABLE, value)
+    for ignored in ("", "~/.cache", "relative"):
+        monkeypatch.setenv("XDG_CACHE_HOME", ignored)
+        assert cache_folder() == tmp_path / expected
+    if not value.strip():
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+        assert cache_folder() == tmp_path / "xdg" / "sb3_follow_object"
+    monkeypatch.setenv(CACHE_VARIABLE, "here/goals")
+    assert cache_folder() == Path("here/goals")
+
+
+def test_without_a_home_the_variable_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, "~no-such-user/goals")
+    with pytest.raises(ValueError, match=f"no home folder .*; set {CACHE_VARIABLE} to a folder"):
+        cache_folder()
+
+
+def test_a_file_system_without_locks_is_worked_in_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(number: int) -> Any:
+        def flock(*arguments: Any) -> None:
+            raise OSError(number, "as the file system says")
+
+        return flock
+
+    monkeypatch.setattr(fcntl, "flock", refuse(errno.ENOLCK))
+    with lock(tmp_path, wait=True):
+        pass
+    monkeypatch.setattr(fcntl, "flock", refuse(errno.EIO))
+    with pytest.raises(OSError, match="as the file system says"), lock(tmp_path, wait=True):
+        pass
