@@ -66,13 +66,6 @@ class ObjectEnv(SingleEnv):
         render_mode: str | None = None,
         show_regions: bool = False,
     ) -> None:
-        self._arguments: dict[str, Any] = {
-            "task": task,
-            "on_table": on_table,
-            "reward_type": reward_type,
-            "render_mode": render_mode,
-            "show_regions": show_regions,
-        }
         self._set_up(object_scene(find_task(task)), reward_type, render_mode, show_regions)
         self.simulation.on_table = on_table
 

@@ -42,6 +42,10 @@ class Picture:
         self._canvas: _Canvas | None = None
         self._window: _Window | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Graphics are of one process and one object: a copy opens its own once it draws.
+        return {**vars(self), "_canvas": None, "_window": None}
+
     def set_markers(self, points: np.ndarray) -> None:
         """Points (n, 3) in metres to draw from now on.
 
