@@ -13,10 +13,13 @@ from gymnasium.utils import seeding
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..common.copies import WholeCopies
+from ..common.vec_env_copies import let_vec_envs_be_copied
 from .batch import BatchedSimulation
 from .picture import Picture
 from .scene import Scene
 from .tasks import SUCCESS_DISTANCE
+
+let_vec_envs_be_copied()
 
 RewardType = Literal["sparse", "dense"]
 RENDER_MODES = ("human", "rgb_array")

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped, unwrap_vec_wrapper
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from ..imagination.curriculum import Curriculum
 from ..imagination.vec_env import ImaginedGoalVecEnv, imagination_of
 from ..settings.ranges import check_positive
+from .copyable import CopyableCallback
 from .env_copies import copies_for_tests
 from .rollout import Observation, OnStep, noise_free, run_episodes
 
 
-class CurriculumCallback(BaseCallback):
+class CurriculumCallback(CopyableCallback):
     """Test the policy on h_max without noise and advance k_max (paper, Algorithm 1).
 
     A test is due after every ``every`` cycles. A cycle is a rollout that has finished at least one

@@ -169,7 +169,7 @@ def _copy(env: Any, memo: Memo) -> Any:
 
 def _copy_contents(env: Any, memo: Memo) -> Any:
     """Copy a VecEnv attribute by attribute: SB3's own wrappers know no other way."""
-    twin = memo[id(env)] = type(env).__new__(type(env))
+    twin = memo[id(env)] = object.__new__(type(env))
     try:
         vars(twin).update(copy.deepcopy(vars(env), memo))
     except Exception as error:

@@ -1,4 +1,4 @@
-"""Copying what cannot be copied piece by piece: what a process holds, and what refers to it."""
+"""What copy and pickle may do with what a process holds: copy it whole, or refuse in a sentence."""
 
 from __future__ import annotations
 

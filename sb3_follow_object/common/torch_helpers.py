@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 
 import torch as th
 
@@ -28,6 +30,16 @@ def threads_at(n: int | None) -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(earlier)
+
+
+@cache
+def one_thread_after_forks() -> None:
+    """Let PyTorch use one thread in processes that are forked off from now on.
+
+    Its other threads do not survive a fork, and a child that waited for them would wait for ever.
+    """
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=lambda: th.set_num_threads(1))
 
 
 def lowest(q_values: list[th.Tensor]) -> th.Tensor:

@@ -128,7 +128,7 @@ class FollowObject:
         self.full_id = full_id  # with the module that registers it, as given
         self.imagine = imagine
         self.seed = seed
-        self.report = report or (lambda sentence: None)
+        self.report = report or _say_nothing
         self.object_stage = ObjectStage(
             self.settings, self.report, needs_networks=reads_object_networks(algorithm or {})
         )
@@ -406,3 +406,7 @@ class FollowObject:
         env = make_vec(self.env_id, self.settings["n_envs"], self.settings["n_threads"], **options)
         env.seed(stream_seed(self.seed, purpose))
         return env
+
+
+def _say_nothing(sentence: str) -> None:
+    """Report to nobody."""

@@ -15,7 +15,9 @@ import torch
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
+from ..common.copies import WholeCopies
 from ..common.files import atomic_write
+from ..common.torch_helpers import one_thread_after_forks
 from .predictor_files import (
     FACTS_FILE,
     FORMAT,
@@ -36,8 +38,10 @@ SMALLEST_STD = 1e-2
 
 Progress = Callable[[int, float], None]
 
+one_thread_after_forks()
 
-class GoalPredictor:
+
+class GoalPredictor(WholeCopies):
     """A network that imagines where the object would be after k steps (paper, section 4.2).
 
     Made by ``fit`` or ``load``.

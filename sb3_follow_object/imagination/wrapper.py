@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..common.copies import WholeCopies
 from ..common.providers import provider
 from ..envs import IDS, physics_id
 from .curriculum import Curriculum
@@ -24,7 +25,9 @@ from .predictor_files import POSITION
 AUTO = "auto"  # the predictor that is kept for the environment's task, learned where it is not
 
 
-class ImaginedGoalWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
+class ImaginedGoalWrapper(
+    WholeCopies, gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]
+):
     """Show imagined goals in one gymnasium environment (paper, Algorithm 1).
 
     Infos carry ``original_goal`` (3,) in metres, ``imagined_level`` (0 where the original goal is

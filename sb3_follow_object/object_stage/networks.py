@@ -13,6 +13,7 @@ from stable_baselines3.common.torch_layers import create_mlp, get_actor_critic_a
 from torch import nn
 
 from ..common.array_trees import load_tree, save_tree
+from ..common.copies import WholeCopies
 from ..common.torch_helpers import lowest
 from ..ddpg.her_ddpg import HerDDPG
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
@@ -24,7 +25,7 @@ OBSERVATION, GOAL, ACTION = 12, 3, 7  # of the object's environment
 _CRITICS_LIMIT = 8
 
 
-class ObjectNetworks(nn.Module):
+class ObjectNetworks(WholeCopies, nn.Module):
     """The object's critic and policy, and the action that leads from one of its states to the next.
 
     Made by `learned` or `load`.

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
+from ..common.copies import WholeCopies
 from ..envs.tasks import SUCCESS_DISTANCE
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .record_buffer import ACHIEVED, DESIRED, HALVES, NEXT_DESIRED
@@ -92,7 +93,7 @@ def device_replay_of(buffer: Any, device: th.device, wanted: bool | None) -> Dev
         return None
 
 
-class DeviceReplay:
+class DeviceReplay(WholeCopies):
     """A copy of a replay buffer on a device, sampled there with a generator of its own.
 
     What was stored since the last `refresh` is uploaded in one piece. Distribution and rewards are

@@ -273,7 +273,7 @@ def test_what_cannot_be_copied_is_named_with_the_way_out(name: str) -> None:
     make, sentence = REFUSED[name]
     env = make()
     with pytest.raises(
-        ValueError, match="CurriculumCallback cannot copy .*give it a test_env"
+        ValueError, match=r"CurriculumCallback cannot copy .*give it a test_env"
     ) as e:
         copies_for_tests(env)
     assert e.match(sentence) and "\n" not in str(e.value)
