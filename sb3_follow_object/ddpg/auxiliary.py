@@ -10,10 +10,9 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from ..common.copies import WholeCopies
 from ..common.providers import provided, provider
 from ..common.suggestions import did_you_mean
-from ..common.torch_helpers import lowest, matmul_at
+from ..common.torch_helpers import WholeModule, lowest, matmul_at
 from ..settings.keywords import check_keywords
 from .policies import HerPolicy
 
@@ -90,7 +89,7 @@ class AuxiliaryReward(nn.Module):
         """Learn from a batch whose rewards have been taken."""
 
 
-class AuxiliaryCritic(WholeCopies, nn.Module):
+class AuxiliaryCritic(WholeModule):
     """Critic, target critic and optimiser of an auxiliary reward.
 
     Args:

@@ -13,8 +13,7 @@ from stable_baselines3.common.torch_layers import create_mlp, get_actor_critic_a
 from torch import nn
 
 from ..common.array_trees import load_tree, save_tree
-from ..common.copies import WholeCopies
-from ..common.torch_helpers import lowest
+from ..common.torch_helpers import WholeModule, lowest
 from ..ddpg.her_ddpg import HerDDPG
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
 from ..imagination.predictor_files import valid_hidden
@@ -25,7 +24,7 @@ OBSERVATION, GOAL, ACTION = 12, 3, 7  # of the object's environment
 _CRITICS_LIMIT = 8
 
 
-class ObjectNetworks(WholeCopies, nn.Module):
+class ObjectNetworks(WholeModule):
     """The object's critic and policy, and the action that leads from one of its states to the next.
 
     Made by `learned` or `load`.
