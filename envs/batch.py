@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.copies import WholeCopies
 from ..common.numbers import checked_whole
 from .physics_engine import mujoco
 from .scene import N_SUBSTEPS, OBJECT, TUBE, Scene, weld_targets
@@ -26,8 +28,11 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-class BatchedSimulation:
+class BatchedSimulation(WholeCopies):
     """N copies of a scene, moved through the mocap body that the scene's one weld pulls.
+
+    A copy of it, pickled or not, steps as it does, with memory and threads of its own; after a fork
+    both processes have what they need, too.
 
     What an observation and the next action need is read right after stepping, as the last substep
     left it: poses then lag the joint positions by one substep, as in Gymnasium-Robotics.
@@ -51,34 +56,44 @@ class BatchedSimulation:
         self.scene = scene
         self.n_envs = n_envs
         self.n_threads = min(n_threads, n_envs)
-        self._pool = ThreadPoolExecutor(self.n_threads - 1) if self.n_threads > 1 else None
-        model = scene.model
-        self.dt = model.opt.timestep * N_SUBSTEPS
-        self.data = [mujoco.MjData(model) for _ in range(n_envs)]
         self.goals = np.zeros((n_envs, 3))
+        # What mujoco warned of in a copy's episode, and when; None while all is well. Such a copy
+        # rests on what it showed last until it is reset.
+        self.faults: list[str | None] = [None] * n_envs
+        self.steps = np.zeros(n_envs, dtype=np.int64)
+        self._target_pos = np.zeros((n_envs, 3))
+        self._target_quat = np.zeros((n_envs, 4))
+        self._connect()
+
+    def _connect(self) -> None:
+        """Set what belongs to this object in this process; a copy sets its own."""
+        facts = set(vars(self))
+        self._take_memory()
+        self._connected = vars(self).keys() - facts
+
+    def _take_memory(self) -> None:
+        """Set what is mujoco's memory, a view of it or found in the scene; subclasses add to it."""
+        model = self.scene.model
+        self._pool: ThreadPoolExecutor | None = None
+        self._pool_process = 0
+        self.dt = model.opt.timestep * N_SUBSTEPS
+        self.data = [mujoco.MjData(model) for _ in range(self.n_envs)]
         self._mocap, self._welded = weld_targets(model)
-        self._tube = int(model.body(TUBE).mocapid[0]) if scene.task.tube else None
+        self._tube = int(model.body(TUBE).mocapid[0]) if self.scene.task.tube else None
         self._object_qpos = int(model.joint(f"{OBJECT}:joint").qposadr[0])
         self._object_qvel = int(model.joint(f"{OBJECT}:joint").dofadr[0])
         self._object_site = int(model.site(OBJECT).id)
 
         # What each copy shows after a step: name -> (n_envs, ...), and where it is read from.
         self.read: dict[str, np.ndarray] = {}
-        self._views: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in range(n_envs)]
+        self._views: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in range(self.n_envs)]
         self._watch("welded_pos", [d.xpos[self._welded] for d in self.data])
         self._watch("welded_quat", [d.xquat[self._welded] for d in self.data])
         self._watch("object_pos", [d.site_xpos[self._object_site] for d in self.data])
         self._watch("object_mat", [d.site_xmat[self._object_site] for d in self.data])
         self._watch("qvel", [d.qvel for d in self.data])
-
-        # What mujoco warned of in a copy's episode, and when; None while all is well. Such a copy
-        # rests on what it showed last until it is reset.
-        self.faults: list[str | None] = [None] * n_envs
         self._warnings = [d.warning.number for d in self.data]
         self._no_warning = bytes(self._warnings[0].nbytes)
-        self.steps = np.zeros(n_envs, dtype=np.int64)
-        self._target_pos = np.zeros((n_envs, 3))
-        self._target_quat = np.zeros((n_envs, 4))
         self._mocap_pos = [d.mocap_pos[self._mocap] for d in self.data]
         self._mocap_quat = [d.mocap_quat[self._mocap] for d in self.data]
 
@@ -132,10 +147,11 @@ class BatchedSimulation:
         self.control(np.clip(actions, -1.0, 1.0))
         self.steps += 1
         todo = iter(range(self.n_envs))
-        if self._pool is None:
+        if self.n_threads == 1:
             self._drain(todo)
         else:
-            others = [self._pool.submit(self._drain, todo) for _ in range(self.n_threads - 1)]
+            pool = self._threads()
+            others = [pool.submit(self._drain, todo) for _ in range(self.n_threads - 1)]
             self._drain(todo)
             for other in others:
                 other.result()
@@ -158,8 +174,9 @@ class BatchedSimulation:
 
     def close(self) -> None:
         """Let the threads go."""
-        if self._pool is not None:
+        if self._pool is not None and self._pool_process == os.getpid():
             self._pool.shutdown()
+        self._pool = None
 
     # Resuming -------------------------------------------------------------------------------------
 
@@ -203,7 +220,40 @@ class BatchedSimulation:
         for name, values in self.read.items():
             values[:] = state[f"read/{name}"]
 
+    # Copying --------------------------------------------------------------------------------------
+
+    def __getstate__(self) -> dict[str, Any]:
+        facts = {name: value for name, value in vars(self).items() if name not in self._connected}
+        return {**facts, "state": self.get_state()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        facts = dict(state)
+        resumed = facts.pop("state")
+        del facts["_connected"]
+        vars(self).update(facts)
+        self._connect()
+        self.set_state(resumed)
+        # Poses follow from the state, but the next step's start does not: it is put back.
+        for row, data, warnings in zip(resumed["physics"], self.data, self._warnings, strict=True):
+            mujoco.mj_forward(self.scene.model, data)
+            mujoco.mj_setState(self.scene.model, data, row, STATE)
+            warnings[:] = 0
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> BatchedSimulation:
+        twin = memo[id(self)] = type(self).__new__(type(self))
+        twin.__setstate__(copy.deepcopy(self.__getstate__(), memo))
+        for theirs, ours in zip(twin.data, self.data, strict=True):
+            mujoco.mj_copyData(theirs, self.scene.model, ours)
+        return twin
+
     # Inside ---------------------------------------------------------------------------------------
+
+    def _threads(self) -> ThreadPoolExecutor:
+        """The threads beside the caller's; those of a parent process do not survive its fork."""
+        if self._pool is None or self._pool_process != os.getpid():
+            self._pool = ThreadPoolExecutor(self.n_threads - 1)
+            self._pool_process = os.getpid()
+        return self._pool
 
     @property
     def _table_top(self) -> float:

@@ -13,18 +13,22 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..common.copies import WholeCopies
+from ..common.vec_env_copies import let_vec_envs_be_copied
 from .batch import BatchedSimulation
 from .physics_engine import mujoco
 from .picture import Picture
 from .scene import Scene
 from .tasks import SUCCESS_DISTANCE
 
+let_vec_envs_be_copied()
+
 RewardType = Literal["sparse", "dense"]
 RENDER_MODES = ("human", "rgb_array")
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 25}
 
 
-class _GoalFace:
+class _GoalFace(WholeCopies):
     """What both faces share: the simulation, its spaces, reward and success, pictures."""
 
     simulation_type: type[BatchedSimulation]
@@ -90,7 +94,6 @@ class SingleEnv(_GoalFace, gym.Env):
     """A batch of one as a gymnasium.Env; it never ends, `gymnasium.make` truncates at T."""
 
     metadata = METADATA
-    _arguments: dict[str, Any]
 
     def _set_up(
         self, scene: Scene, reward_type: RewardType, render_mode: str | None, show_regions: bool
@@ -168,22 +171,6 @@ class SingleEnv(_GoalFace, gym.Env):
             "achieved_goal": achieved[0],
             "desired_goal": self.simulation.goals[0].copy(),
         }
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {
-            "arguments": self._arguments,
-            "simulation": self.simulation.get_state(),
-            "np_random": (self._np_random, self._np_random_seed),
-            "reward_type": self.reward_type,
-            "spec": self.spec,
-        }
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(**state["arguments"])  # type: ignore[misc]
-        self.simulation.set_state(state["simulation"])
-        self._np_random, self._np_random_seed = state["np_random"]
-        self.reward_type = state["reward_type"]
-        self.spec = state["spec"]
 
 
 class BatchVecEnv(_GoalFace, VecEnv):

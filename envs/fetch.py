@@ -9,7 +9,7 @@ import numpy as np
 from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles, rotate
 from .faces import BatchVecEnv, RewardType, SingleEnv
 from .physics_engine import mujoco
-from .scene import FINGER_JOINTS, GRIP_SITE, Scene, fetch_scene
+from .scene import FINGER_JOINTS, GRIP_SITE, fetch_scene
 from .task_table import find_task, task_of
 from .tasks import Task
 
@@ -42,16 +42,16 @@ class FetchSimulation(BatchedSimulation):
     action_size = 4
     observation_size = 25
 
-    def __init__(self, scene: Scene, n_envs: int, n_threads: int | None = None) -> None:
-        super().__init__(scene, n_envs, n_threads)
-        model = scene.model
+    def _take_memory(self) -> None:
+        super()._take_memory()
+        model = self.scene.model
         fingers = [model.joint(name) for name in FINGER_JOINTS]
         self._finger_qpos = np.array([joint.qposadr[0] for joint in fingers])
         self._finger_qvel = np.array([joint.dofadr[0] for joint in fingers])
         self._driven_qpos = model.jnt_qposadr[model.actuator_trnid[:, 0]]
         self._grip_site = int(model.site(GRIP_SITE).id)
         self._controls = [d.ctrl for d in self.data]
-        self.read["grip_jacobian"] = np.zeros((n_envs, 3, model.nv))
+        self.read["grip_jacobian"] = np.zeros((self.n_envs, 3, model.nv))
         self._watch("qpos", [d.qpos for d in self.data])
         self._watch("grip_pos", [d.site_xpos[self._grip_site] for d in self.data])
 
@@ -121,13 +121,6 @@ class FetchEnv(SingleEnv):
         collision: str = "reachable",
         show_regions: bool = False,
     ) -> None:
-        self._arguments: dict[str, Any] = {
-            "task": task,
-            "reward_type": reward_type,
-            "render_mode": render_mode,
-            "collision": collision,
-            "show_regions": show_regions,
-        }
         scene = fetch_scene(find_task(task), collision)
         self._set_up(scene, reward_type, render_mode, show_regions)
 

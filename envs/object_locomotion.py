@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles
@@ -66,13 +64,6 @@ class ObjectEnv(SingleEnv):
         render_mode: str | None = None,
         show_regions: bool = False,
     ) -> None:
-        self._arguments: dict[str, Any] = {
-            "task": task,
-            "on_table": on_table,
-            "reward_type": reward_type,
-            "render_mode": render_mode,
-            "show_regions": show_regions,
-        }
         self._set_up(object_scene(find_task(task)), reward_type, render_mode, show_regions)
         self.simulation.on_table = on_table
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from importlib import import_module
 from typing import Any
@@ -41,6 +42,10 @@ class Picture:
         self._canvas: _Canvas | None = None
         self._window: _Window | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Graphics are of one process and one object: a copy opens its own once it draws.
+        return {**vars(self), "_canvas": None, "_window": None}
+
     def set_markers(self, points: np.ndarray) -> None:
         """Points (n, 3) in metres to draw from now on.
 
@@ -56,8 +61,10 @@ class Picture:
         """One copy as an array (480, 480, 3) of uint8.
 
         Raises:
-            RuntimeError: there is no graphics library to draw with.
+            RuntimeError: there is no graphics library to draw with, or the process was forked off
+                one that draws.
         """
+        _check_process()
         if self._canvas is None:
             self._canvas = _Canvas(whole_model(self._scene))
         self._canvas.show(simulation, index)
@@ -68,8 +75,9 @@ class Picture:
         """One copy in a window, opened the first time.
 
         Raises:
-            RuntimeError: no window can be opened.
+            RuntimeError: no window can be opened, or as for `draw`.
         """
+        _check_process()
         if self._window is None:
             self._window = _Window(whole_model(self._scene))
         with self._window.viewer.lock():
@@ -80,6 +88,8 @@ class Picture:
 
     def close(self) -> None:
         """Let the graphics go."""
+        if _drawn_by not in (None, os.getpid()):
+            return  # they are a parent process's, which frees them
         if self._canvas is not None:
             self._canvas.close()
             self._canvas = None
@@ -107,6 +117,21 @@ class Picture:
         low = np.array([*(reference + region.low), bottom])
         high = np.array([*(reference + region.high), top])
         return (low + high) / 2, np.maximum((high - low) / 2, _THIN)
+
+
+_drawn_by: int | None = None  # the first process that drew, among this one and its parents
+
+
+def _check_process() -> None:
+    """Refuse to draw where a parent did: the threads that its graphics wait for are not here."""
+    global _drawn_by
+    if _drawn_by is None:
+        _drawn_by = os.getpid()
+    elif _drawn_by != os.getpid():
+        raise RuntimeError(
+            "This process was forked off one that draws and cannot draw itself; start it by spawn "
+            "or forkserver."
+        )
 
 
 class _Canvas:

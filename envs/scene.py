@@ -86,6 +86,9 @@ class Scene:
     time: float
     landmarks: Landmarks
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
+        return self
+
 
 @lru_cache(maxsize=32)
 def fetch_scene(task: Task, collision: str = "reachable") -> Scene:

@@ -7,6 +7,7 @@ environment does: it has to be in the tables before rl_zoo3's own commands begin
 from __future__ import annotations
 
 import argparse
+import inspect
 import runpy
 import sys
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 
 from .common.extras import need
 from .ddpg.her_ddpg import HerDDPG
-from .settings.keywords import check_keywords
+from .settings.fields import check_names
 from .settings.presets import preset_file
 
 ALGORITHM = "her_ddpg"
@@ -52,7 +53,7 @@ class ZooHerDDPG(HerDDPG):
 
     def __init__(self, policy: Any, env: Any, **settings: Any):
         settings = _nested(settings)
-        check_keywords("HerDDPG", settings, HerDDPG.__init__)
+        check_names(settings, inspect.signature(HerDDPG.__init__).parameters, "HerDDPG")
         super().__init__(policy, env, **settings)
 
     def learn(

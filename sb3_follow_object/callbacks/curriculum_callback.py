@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped, unwrap_vec_wrapper
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from ..envs import IDS, make_vec
 from ..imagination.curriculum import Curriculum
 from ..imagination.vec_env import ImaginedGoalVecEnv, imagination_of
 from ..settings.stages import CurriculumTestSettings
+from .copyable import CopyableCallback
+from .env_copies import copies_for_tests
 from .rollout import Observation, OnStep, noise_free, run_episodes
 
 
-class CurriculumCallback(BaseCallback):
+class CurriculumCallback(CopyableCallback):
     """Test the policy on h_max without noise and advance k_max (paper, Algorithm 1).
 
     A test is due after every ``every`` cycles. A cycle is a rollout that has finished at least one
@@ -29,8 +29,9 @@ class CurriculumCallback(BaseCallback):
     training that goes on from a loaded model goes on at its k_max.
 
     Args:
-        test_env: ImaginedGoalVecEnv with mode="test", sharing the training's curriculum; None
-            makes as many copies of the training's environment when training starts.
+        test_env: ImaginedGoalVecEnv with mode="test", or wrappers around one, sharing the
+            training's curriculum; None makes as many copies of the training's environment, with all
+            that it is wrapped in, when training starts.
         n_episodes: episodes of a test, >= 1; None, one of every copy.
         every: cycles between tests, >= 1.
         store: whether to put the tests' transitions into the model's replay buffer. It is done
@@ -49,16 +50,17 @@ class CurriculumCallback(BaseCallback):
 
     def __init__(
         self,
-        test_env: ImaginedGoalVecEnv | None = None,
+        test_env: VecEnv | None = None,
         n_episodes: int | None = CurriculumTestSettings.n_episodes,
         every: int = CurriculumTestSettings.every,
         store: bool = CurriculumTestSettings.store,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        is_test = isinstance(test_env, ImaginedGoalVecEnv) and test_env.mode == "test"
-        if test_env is not None and not is_test:
-            raise ValueError("test_env must be an ImaginedGoalVecEnv with mode='test'.")
+        if test_env is not None:
+            imagined = unwrap_vec_wrapper(test_env, ImaginedGoalVecEnv)
+            if imagined is None or imagined.mode != "test":
+                raise ValueError("test_env must be an ImaginedGoalVecEnv with mode='test'.")
         settings = CurriculumTestSettings(n_episodes=n_episodes, every=every, store=store)
         self._test_env = test_env
         self.n_episodes = settings.n_episodes
@@ -70,7 +72,7 @@ class CurriculumCallback(BaseCallback):
         self._started = False
 
     @property
-    def test_env(self) -> ImaginedGoalVecEnv:
+    def test_env(self) -> VecEnv:
         """The environment that tests run in; one of the callback's own exists once training has."""
         if self._test_env is None:
             raise RuntimeError("the test environment is made when training starts")
@@ -79,7 +81,7 @@ class CurriculumCallback(BaseCallback):
     @property
     def curriculum(self) -> Curriculum:
         """The curriculum that the tests advance."""
-        return self.test_env.curriculum
+        return imagination_of(self.test_env, "CurriculumCallback")[1]
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed training needs (JSON types); the curriculum has its own state."""
@@ -97,7 +99,9 @@ class CurriculumCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         if self._test_env is None:
-            self._test_env = _test_copies(self.training_env)
+            self._test_env = copies_for_tests(self.training_env)
+            # NumPy's global stream is the one that SB3 seeds.
+            self._test_env.seed(int(np.random.randint(2**31 - 1000)))
         else:
             _check_curriculum(self.training_env, self.curriculum)
         if self._started and self.model.num_timesteps == 0:
@@ -173,43 +177,6 @@ class CurriculumCallback(BaseCallback):
             buffer.add(obs, next_obs, stored, rewards, dones, infos)
 
         return store
-
-
-def _test_copies(training_env: VecEnv) -> ImaginedGoalVecEnv:
-    """Make as many copies of the training's environment, which show h_max of its curriculum."""
-    predictor, curriculum = imagination_of(training_env, "CurriculumCallback without a test_env")
-    spec = training_env.get_attr("spec", indices=[0])[0]
-    if spec is None:
-        raise ValueError(
-            "CurriculumCallback cannot copy an environment that gymnasium.make did not make; "
-            "give it a test_env."
-        )
-    options = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
-    if spec.id in IDS:
-        options.pop("task", None)  # the id says it
-        options["reward_type"] = training_env.get_attr("reward_type", indices=[0])[0]
-    venv = make_vec(spec.id, training_env.num_envs, **options)
-    test_env = ImaginedGoalVecEnv(venv, predictor, curriculum, mode="test")
-    ours, theirs = _facts(test_env), _facts(training_env)
-    for name, value in theirs.items():
-        if ours[name] != value:
-            raise ValueError(
-                f"The training's {name} {value} are not those of {spec.id}, {ours[name]}: give "
-                "CurriculumCallback a test_env with the same wrappers."
-            )
-    # NumPy's global stream is the one that SB3 seeds.
-    test_env.seed(int(np.random.randint(2**31 - 1000)))
-    return test_env
-
-
-def _facts(env: VecEnv) -> dict[str, Any]:
-    """Return what wrappers change that a test has to have too."""
-    spaces_of = getattr(env.observation_space, "spaces", {})
-    return {
-        "observations": {key: space.shape for key, space in spaces_of.items()},
-        "actions": env.action_space,
-        "steps an episode": env.get_attr("spec", indices=[0])[0].max_episode_steps,
-    }
 
 
 def _check_curriculum(training_env: VecEnv, curriculum: Curriculum) -> None:

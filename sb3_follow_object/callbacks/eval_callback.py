@@ -9,17 +9,17 @@ import time
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped
 
 from ..common.files import atomic_write
 from ..common.numbers import checked_number, checked_whole
 from ..common.seeds import stream_seed
+from .copyable import CopyableCallback
 from .curriculum_callback import CurriculumCallback
 from .rollout import noise_free, run_episodes
 
 
-class OriginalGoalEvalCallback(BaseCallback):
+class OriginalGoalEvalCallback(CopyableCallback):
     """Evaluate the policy without noise on fresh episodes with original goals.
 
     Runs at the first end of a rollout after each ``every_steps`` environment steps. Records
@@ -118,6 +118,18 @@ class OriginalGoalEvalCallback(BaseCallback):
         self._resumed = True
         self._wall_before = float(state["wall_s"])
         self._started = time.monotonic()
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self.csv_path is not None:
+            raise ValueError(
+                f"an evaluation that writes {self.csv_path} cannot be copied, as two would write "
+                "one file: make another with a csv_path of its own"
+            )
+        return {**super().__getstate__(), "_wall_before": self.wall_s}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._started = time.monotonic()  # another process may count from another moment
 
     @property
     def wall_s(self) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 import torch as th
 from safetensors import SafetensorError, safe_open
 
+from .copies import WholeCopies
 from .files import atomic_file
 
 _TREE = "tree"  # the metadata entry that holds everything but the arrays
@@ -78,7 +79,7 @@ class Snapshot:
         return _LENGTH_BYTES + len(header) + end
 
 
-class Camera:
+class Camera(WholeCopies):
     """Takes snapshots of nested dicts, lists and tuples of arrays, tensors and JSON values.
 
     It keeps the memory of its last snapshot for the next one, which must not be taken before the

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.utils import get_device
+from torch import nn
+
+from .copies import WholeCopies
 
 
 @contextmanager
@@ -30,6 +35,39 @@ def threads_at(n: int | None) -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(earlier)
+
+
+def own(tensor: th.Tensor) -> th.Tensor:
+    """Return a tensor that no other process writes to: itself, or a copy of a shared one."""
+    return tensor.clone() if tensor.is_shared() else tensor
+
+
+class WholeModule(WholeCopies, nn.Module):
+    """A module whose copies have memory of their own.
+
+    PyTorch lets a module that multiprocessing sends share its memory with the one that stays, so
+    that training either would change both.
+    """
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        for tensor in (*self.parameters(), *self.buffers()):
+            tensor.data = own(tensor.data)
+        for module in self.modules():
+            optimizer = vars(module).get("optimizer")
+            for values in optimizer.state.values() if optimizer is not None else ():
+                for name, value in values.items():
+                    values[name] = own(value) if isinstance(value, th.Tensor) else value
+
+
+@cache
+def one_thread_after_forks() -> None:
+    """Let PyTorch use one thread in processes that are forked off from now on.
+
+    Its other threads do not survive a fork, and a child that waited for them would wait for ever.
+    """
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=lambda: th.set_num_threads(1))
 
 
 def lowest(q_values: list[th.Tensor]) -> th.Tensor:

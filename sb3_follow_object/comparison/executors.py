@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
+from ..common.copies import NoCopies
 from .worker import INTERRUPTED, Job
 
 Message = dict[str, Any]
@@ -37,13 +38,15 @@ class Executor(Protocol):
         """Ask all jobs to write a checkpoint and end; asked again, they end at once."""
 
 
-class LocalExecutor:
+class LocalExecutor(NoCopies):
     """Runs each job in a process of its own, which has its share of the cores from the start.
 
     Args:
         slots: jobs at once, >= 1.
         logs: folder for what the jobs print; is created.
     """
+
+    no_copies = "a LocalExecutor holds running processes and cannot be copied: make another"
 
     def __init__(self, slots: int, logs: Path):
         self.slots = slots

@@ -9,19 +9,22 @@ from typing import Any
 from rich.live import Live
 from rich.table import Table
 
+from ..common.copies import NoCopies
 from ..runs.progress import Terminal
 
 # Seconds between two reports where there is no terminal to draw on.
 _LINES_EVERY = 60.0
 
 
-class GridDisplay:
+class GridDisplay(NoCopies):
     """Shows each job under way, how many runs are done and about how long the rest will take.
 
     Args:
         quiet: show nothing but trouble.
         clock: tells the time in seconds.
     """
+
+    no_copies = "a GridDisplay draws on this process's terminal and cannot be copied: make another"
 
     def __init__(self, quiet: bool = False, clock: Any = time.monotonic):
         self._console = Terminal(quiet=quiet)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..common.copies import NoCopies
 from ..common.extras import need
 from ..common.files import atomic_write, lock
 from ..runs.object_stage_files import OBJECT_STAGE
@@ -54,12 +55,14 @@ def connect(address: str, threads: int = 1) -> int:
     return cores
 
 
-class RayExecutor:
+class RayExecutor(NoCopies):
     """Runs each job as a Ray task; a run's files travel with it, both ways.
 
     Args:
         slots: jobs at once, >= 1; Ray starts one where and when its cores are free.
     """
+
+    no_copies = "a RayExecutor holds running tasks and cannot be copied: make another"
 
     def __init__(self, slots: int):
         self.slots = slots

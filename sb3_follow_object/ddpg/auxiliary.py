@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from ..common.providers import provider
-from ..common.torch_helpers import lowest, matmul_at
+from ..common.torch_helpers import WholeModule, lowest, matmul_at
 from ..settings.fields import check_names
 from ..settings.learning import AUXILIARY as KIND
 from ..settings.learning import AuxiliarySettings, check_auxiliary
@@ -90,7 +90,7 @@ class AuxiliaryReward(nn.Module):
         """Learn from a batch whose rewards have been taken."""
 
 
-class AuxiliaryCritic(nn.Module):
+class AuxiliaryCritic(WholeModule):
     """Critic, target critic and optimiser of an auxiliary reward.
 
     Args:

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from stable_baselines3 import DDPG
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
@@ -21,7 +22,9 @@ from stable_baselines3.common.type_aliases import (
     TrainFrequencyUnit,
 )
 from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from ..common.copies import WholeCopies
 from ..common.numbers import checked_whole
 from ..common.torch_helpers import matmul_at, threads_at
 from ..replay.device_replay import device_replay_of
@@ -40,7 +43,7 @@ _SAMPLE_CHUNK = 32_768
 _DEVICE_CHUNK = 262_144
 
 
-class HerDDPG(DDPG):
+class HerDDPG(WholeCopies, DDPG):
     """DDPG as the HER papers run it: normaliser, target clip, action L2, random actions.
 
     The differences from SB3's DDPG (section 3.2 of the paper and its references):
@@ -302,6 +305,18 @@ class HerDDPG(DDPG):
         super().load_replay_buffer(path, truncate_last_traj)
         assert self.replay_buffer is not None
         self.moments.buffer_was_loaded(self.replay_buffer)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = vars(self).copy()
+        if "_logger" in state:  # its files and terminal are the original's
+            state |= {"_logger": Logger(None, []), "_custom_logger": False}
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        buffer = self.replay_buffer
+        if isinstance(buffer, HerReplayBuffer) and buffer.env is None and self.env is not None:
+            buffer.set_env(self.env)  # a pickled buffer leaves it out
 
     def _excluded_save_params(self) -> list[str]:
         names = ("auxiliary_critic", "_updates", "_device_replay")

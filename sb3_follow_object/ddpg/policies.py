@@ -14,8 +14,11 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
+from ..common.torch_helpers import WholeModule, one_thread_after_forks
 from ..settings.learning import PolicySettings
 from .layer_norm import LayerNorm
+
+one_thread_after_forks()
 
 
 class NormalizedGoalExtractor(BaseFeaturesExtractor):
@@ -62,7 +65,7 @@ class LayerNormCritic(ContinuousCritic):
             self.q_networks[idx] = q_net
 
 
-class HerPolicy(TD3Policy):
+class HerPolicy(WholeModule, TD3Policy):
     """Actor and critics of three layers of 256 on normalised observations and goals.
 
     `predict` asks `actor_average`, a running average of the actor's weights, or the actor itself

@@ -53,6 +53,10 @@ class Updates:
         self._graphs: dict[Any, _Graph] = {}
         self._n_calls = 0
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A graph is bound to the memory of the networks that it was captured on.
+        return {"_model": self._model, "_graphs": {}, "_n_calls": 0}
+
     def run(
         self,
         chunk: Transitions,

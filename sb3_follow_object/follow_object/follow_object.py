@@ -139,7 +139,7 @@ class FollowObject:
         self.full_id = full_id  # with the module that registers it, as given
         self.imagine: bool = self.settings["imagine"]
         self.seed: int = self.settings["seed"]
-        self.report = report or (lambda sentence: None)
+        self.report = report or _say_nothing
         self.object_stage = ObjectStage(
             self.settings,
             self.report,
@@ -416,3 +416,7 @@ class FollowObject:
         env = make_vec(self.env_id, self.settings["n_envs"], self.settings["n_threads"], **options)
         env.seed(stream_seed(self.seed, purpose))
         return env
+
+
+def _say_nothing(sentence: str) -> None:
+    """Report to nobody."""

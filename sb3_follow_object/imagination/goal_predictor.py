@@ -14,9 +14,10 @@ import safetensors.torch
 import torch
 from torch import nn
 
+from ..common.copies import WholeCopies
 from ..common.files import atomic_write
 from ..common.numbers import checked_whole
-from ..common.torch_helpers import usable_device
+from ..common.torch_helpers import one_thread_after_forks, usable_device
 from ..settings.learning import PredictorSettings
 from .predictor_files import (
     FACTS_FILE,
@@ -35,8 +36,10 @@ SMALLEST_STD = 1e-2
 
 Progress = Callable[[int, float], None]
 
+one_thread_after_forks()
 
-class GoalPredictor:
+
+class GoalPredictor(WholeCopies):
     """A network that imagines where the object would be after k steps (paper, section 4.2).
 
     Made by ``fit`` or ``load``.

@@ -14,17 +14,21 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from ..common.copies import WholeCopies
+from ..common.vec_env_copies import let_vec_envs_be_copied, reduce_vec_wrapper
 from .curriculum import Curriculum
 from .goal_env import STREAM, Observation, check_horizons, checked_goals, success_method
 from .goal_predictor import GoalPredictor
 from .imagined_goals import draw_goals, imagine
 from .predictor_files import POSITION
 
+let_vec_envs_be_copied()
+
 MODES = ("train", "test")
 SHARED = ("predictor", "curriculum")  # what all copies of a vectorised environment share
 
 
-class ImaginedGoalVecEnv(VecEnvWrapper):
+class ImaginedGoalVecEnv(WholeCopies, VecEnvWrapper):
     """Show imagined goals in a vectorised environment (paper, Algorithm 1).
 
     Observations, infos and the ends of episodes are those of ``ImaginedGoalWrapper``, and
@@ -160,6 +164,9 @@ class ImaginedGoalVecEnv(VecEnvWrapper):
         self._rng.bit_generator.state = state["rng"]
         if "venv" in state:
             self.venv.set_state(state["venv"])  # type: ignore[attr-defined]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduce_vec_wrapper(self)
 
     def _draw(self, rows: np.ndarray, obs: Observation) -> None:
         """Give the episodes that start in ``rows`` their goals."""

@@ -13,18 +13,21 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..common.copies import WholeCopies
 from ..common.providers import provider
 from ..envs import IDS, physics_id
 from .curriculum import Curriculum
 from .goal_env import STREAM, Observation, check_horizons, checked_goals, success_method
 from .goal_predictor import GoalPredictor
-from .imagined_goals import draw_goals
+from .imagined_goals import draw_goals, imagine
 from .predictor_files import POSITION
 
 AUTO = "auto"  # the predictor that is kept for the environment's task, learned where it is not
 
 
-class ImaginedGoalWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]):
+class ImaginedGoalWrapper(
+    WholeCopies, gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray]
+):
     """Show imagined goals in one gymnasium environment (paper, Algorithm 1).
 
     Infos carry ``original_goal`` (3,) in metres, ``imagined_level`` (0 where the original goal is
@@ -45,6 +48,8 @@ class ImaginedGoalWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.n
 
     Attributes:
         active: whether episodes that begin show imagined goals.
+        mode: "train" draws original or imagined goals; "test" shows h_max, as the copies do that a
+            CurriculumCallback makes for its tests.
 
     Raises:
         ValueError: the environment has no 3-D goals, rewards or success for any goal, the
@@ -62,6 +67,7 @@ class ImaginedGoalWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.n
         self._compute_reward = env.get_wrapper_attr("compute_reward")
         self._is_success = env.get_wrapper_attr(success_method(env.has_wrapper_attr))
         self.active = isinstance(curriculum, Curriculum)
+        self.mode = "train"
         self.curriculum = (
             curriculum if isinstance(curriculum, Curriculum) else _curriculum(env, curriculum)
         )
@@ -90,13 +96,7 @@ class ImaginedGoalWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.n
         self._original = obs["desired_goal"].copy()
         self._shown, self._level = self._original, 0
         if self.active:
-            shown, level = draw_goals(
-                self.predictor,
-                self.curriculum,
-                obs["achieved_goal"][None],
-                obs["desired_goal"][None],
-                self._rng,
-            )
+            shown, level = self._draw(obs["achieved_goal"][None], obs["desired_goal"][None])
             self._shown, self._level = shown[0].astype(self._dtype), int(level[0])
         return self._relabel(obs), {**info, **self._facts()}
 
@@ -118,6 +118,13 @@ class ImaginedGoalWrapper(gym.Wrapper[Observation, np.ndarray, Observation, np.n
         """Follow a curriculum that advances elsewhere (``Curriculum.state_dict``), from now on."""
         self.curriculum.load_state_dict(state)
         self.active = True
+
+    def _draw(self, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the goal shown (1, 3) and its level (1,) in an episode that begins."""
+        if self.mode == "test":
+            level = np.array([self.curriculum.k_max])
+            return imagine(self.predictor, self.curriculum, start, goal, level), level
+        return draw_goals(self.predictor, self.curriculum, start, goal, self._rng)
 
     def _relabel(self, obs: Observation) -> Observation:
         return {**obs, "desired_goal": self._shown.copy()}

@@ -14,7 +14,7 @@ from torch import nn
 
 from ..common.array_trees import load_tree, save_tree
 from ..common.numbers import checked_whole
-from ..common.torch_helpers import lowest
+from ..common.torch_helpers import WholeModule, lowest
 from ..ddpg.her_ddpg import HerDDPG
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
 from ..imagination.predictor_files import valid_hidden
@@ -26,7 +26,7 @@ FORMAT = 1
 OBSERVATION, GOAL, ACTION = 12, 3, 7  # of the object's environment
 
 
-class ObjectNetworks(nn.Module):
+class ObjectNetworks(WholeModule):
     """The object's critic and policy, and the action that leads from one of its states to the next.
 
     Made by `learned` or `load`.

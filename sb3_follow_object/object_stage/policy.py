@@ -10,6 +10,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..callbacks.copyable import CopyableCallback
 from ..callbacks.rollout import run_episodes
 from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
 from ..ddpg.her_ddpg import HerDDPG
@@ -33,7 +34,7 @@ class ObjectPaths:
     env_steps: int
 
 
-class StopWhenSolved(BaseCallback):
+class StopWhenSolved(CopyableCallback):
     """Tests the policy without noise now and then and stops once it succeeds often enough.
 
     Args:

@@ -11,6 +11,8 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
+from ..common.copies import WholeCopies
+from ..common.torch_helpers import own
 from ..envs.tasks import SUCCESS_DISTANCE
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .record_buffer import ACHIEVED, DESIRED, HALVES, NEXT_DESIRED
@@ -92,7 +94,7 @@ def device_replay_of(buffer: Any, device: th.device, wanted: bool | None) -> Dev
         return None
 
 
-class DeviceReplay:
+class DeviceReplay(WholeCopies):
     """A copy of a replay buffer on a device, sampled there with a generator of its own.
 
     What was stored since the last `refresh` is uploaded in one piece. Distribution and rewards are
@@ -118,6 +120,10 @@ class DeviceReplay:
         self._records = self._room_for(buffer.records)
         self._achieved = self._room_for(buffer.achieved)
         self._lists: dict[bool, tuple[Any, th.Tensor, th.Tensor]] = {}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._records, self._achieved = own(self._records), own(self._achieved)
 
     @staticmethod
     def _check(buffer: FollowObjectReplayBuffer) -> None:

@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from ..common.copies import WholeCopies
+
 _BUCKETS = 2  # for each episode: most points then need no search, and the guide is small
 
 
-class EpisodeTable:
+class EpisodeTable(WholeCopies):
     """The finished episodes of the buffer: where each starts and how long it is.
 
     Sampling draws from this table, never from the slots, and finds the episode of a drawn number by

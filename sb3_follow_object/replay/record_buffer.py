@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from ..common.copies import WholeCopies
 from .records import Records
 
 HALVES = ("observations", "next_observations")
@@ -48,7 +50,7 @@ class Gathered:
         )
 
 
-class RecordReplayBuffer(HerReplayBuffer):
+class RecordReplayBuffer(WholeCopies, HerReplayBuffer):
     """HerReplayBuffer whose arrays are views of float32 records; see `Records`.
 
     Physics in float64 is needed while stepping, not while learning. Images and what is not float
@@ -147,6 +149,12 @@ class RecordReplayBuffer(HerReplayBuffer):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._connect()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RecordReplayBuffer:
+        twin = memo[id(self)] = type(self).__new__(type(self))
+        twin.__setstate__(copy.deepcopy(self.__getstate__(), memo))
+        twin.env = copy.deepcopy(self.env, memo)  # only pickles leave it out, as SB3's do
+        return twin
 
     def _gather(self, flat: np.ndarray, achieved: np.ndarray) -> Gathered:
         """Copy the transitions with indices slot * n_envs + environment (n,).

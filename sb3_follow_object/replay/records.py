@@ -8,12 +8,14 @@ from typing import Any, TypeVar
 import numpy as np
 import torch as th
 
+from ..common.copies import WholeCopies
+
 _Batch = TypeVar("_Batch", np.ndarray, th.Tensor)
 _LINE = 64  # bytes of a cache line
 _FLOAT = np.dtype(np.float32).itemsize
 
 
-class Records:
+class Records(WholeCopies):
     """A float32 record for each (slot, environment), and its fields as views.
 
     A batch drawn at random from millions of transitions costs what its cache misses cost: an array

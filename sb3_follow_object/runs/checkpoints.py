@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.array_trees import Camera, Snapshot, load_tree
+from ..common.copies import NoCopies
 from ..common.reports import Report, Trouble
 
 CHECKPOINTS = "checkpoint-*.safetensors"
@@ -38,7 +39,7 @@ def load_newest(folder: Path, report: Report) -> Any:
     return None
 
 
-class Checkpoints:
+class Checkpoints(NoCopies):
     """Writes a run's checkpoints while the training goes on, and keeps the last of them.
 
     The training waits only while its state is copied; hashing and writing are a thread's. The
@@ -49,6 +50,8 @@ class Checkpoints:
         keep: how many to keep, >= 1.
         report: called with a sentence for each checkpoint, or with what went wrong.
     """
+
+    no_copies = "Checkpoints write one folder and cannot be copied: make others for another run"
 
     def __init__(self, folder: Path, keep: int, report: Report):
         self.folder = folder

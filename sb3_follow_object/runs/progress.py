@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from ..common.copies import NoCopies
 from ..common.reports import Trouble
 
 # Seconds between two lines where there is no terminal to draw a bar on.
@@ -47,13 +48,15 @@ class Terminal(Console):
             self.quiet = True
 
 
-class ProgressBar:
+class ProgressBar(NoCopies):
     """Shows env steps, success, k_max and steps per second.
 
     Args:
         total: env steps of the whole run.
         quiet: show nothing but trouble.
     """
+
+    no_copies = "a ProgressBar draws on this process's terminal and cannot be copied: make another"
 
     def __init__(self, total: int, quiet: bool = False):
         self._quiet = quiet

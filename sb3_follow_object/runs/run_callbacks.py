@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from ..callbacks.eval_callback import OriginalGoalEvalCallback
+from ..common.copies import NoCopies
 from ..follow_object.follow_object import FollowObject
 from .checkpoints import Checkpoints
 from .run_folder import BEST_POLICY, POLICY
@@ -19,11 +20,13 @@ from .run_folder import BEST_POLICY, POLICY
 Progress = Callable[[dict[str, Any]], None]
 
 
-class StopSignals:
+class StopSignals(NoCopies):
     """Notes SIGINT and SIGTERM, so that a training can end where nothing is lost.
 
     A second signal raises KeyboardInterrupt at once.
     """
+
+    no_copies = "StopSignals hold this process's signal handlers and cannot be copied: make others"
 
     def __init__(self) -> None:
         self.requested = False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import RescaleAction
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
@@ -187,7 +186,8 @@ def test_copies_made_from_settings_follow_one_curriculum(vec_env: Any) -> None:
         assert env.get_attr("active") == [True, True]
         start, goal = np.array([[1.3, 0.7, 0.42]]), np.array([[1.4, 0.8, 0.42]])
         np.testing.assert_array_equal(
-            callback.test_env.predictor.paths(start, goal), get_predictor(TASK).paths(start, goal)
+            callback.test_env.get_attr("predictor")[0].paths(start, goal),
+            get_predictor(TASK).paths(start, goal),
         )
         # The tests, rows T to 2T, have the training's kind of reward.
         tests = model.replay_buffer.rewards[HORIZON : 2 * HORIZON]
@@ -196,30 +196,9 @@ def test_copies_made_from_settings_follow_one_curriculum(vec_env: Any) -> None:
         env.close()
 
 
-class Renamed(gym.ObservationWrapper):
-    """Adds an entry to the observation, which copies made from the id will not have."""
-
-    def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        entries = dict(env.observation_space.spaces)  # type: ignore[attr-defined]
-        entries["extra"] = gym.spaces.Box(0.0, 1.0, (1,))
-        self.observation_space = gym.spaces.Dict(entries)
-
-    def observation(self, observation: Any) -> Any:
-        return {**observation, "extra": np.zeros(1, np.float32)}
-
-
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: gym.make(TASK), "ImaginedGoalWrapper; this one imagines no goals"),
-        (lambda: ImaginedGoalWrapper(Renamed(gym.make(TASK))), "with the same wrappers"),
-    ],
-    ids=["not wrapped", "wrapped inside"],
-)
-def test_a_callback_says_what_it_cannot_copy(make: Any, sentence: str) -> None:
-    with pytest.raises(ValueError, match=sentence):
-        learner(make()).learn(1, callback=CurriculumCallback())
+def test_a_callback_says_that_no_goals_are_imagined() -> None:
+    with pytest.raises(ValueError, match="ImaginedGoalWrapper; this one imagines no goals"):
+        learner(gym.make(TASK)).learn(1, callback=CurriculumCallback())
 
 
 @pytest.mark.parametrize(
@@ -253,21 +232,3 @@ def test_the_script_in_the_docs_runs(tmp_path: Path) -> None:
     exec(batch, names := {})
     assert names["env"].num_envs == 16
     names["env"].close()
-
-
-@pytest.mark.parametrize(
-    ("wrap", "sentence"),
-    [
-        (lambda: RescaleAction(gym.make(TASK), -0.1, 0.1), "actions"),  # type: ignore[arg-type]
-        (lambda: gym.make(TASK, max_episode_steps=5), "steps an episode"),
-    ],
-)
-def test_copies_for_tests_that_would_be_other_environments_are_refused(
-    wrap: Callable[[], gym.Env], sentence: str
-) -> None:
-    made = get_predictor(TASK)
-    env = wrap()
-    made.horizon = env.spec.max_episode_steps  # type: ignore[union-attr, assignment]
-    model = learner(ImaginedGoalWrapper(env, made, SETTINGS))
-    with pytest.raises(ValueError, match=f"The training's {sentence} .* with the same wrappers"):
-        model.learn(HORIZON, callback=CurriculumCallback())
