@@ -9,16 +9,18 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from ..common.answers import one_each
 from ..imagination.imagined_goals import imagine
 from ..imagination.vec_env import imagination_of
 from ..settings.keywords import check_keywords
 from .cher import GoalSelection
 from .episode_table import EpisodeTable
-from .record_buffer import NEXT_DESIRED, RecordReplayBuffer, check_finite
+from .record_buffer import NEXT_DESIRED, RecordReplayBuffer
+from .steps import check_step, goes_on, lost_steps
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
 GRAVITY = 9.81  # m/s^2
@@ -128,8 +130,8 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
                 f"moved_priority 'energy' reads a height in metres from goals of 3 numbers; these "
                 f"have {goal_shape[-1]}: take 'uniform'"
             )
-        if imagined_ratio > 0.0:
-            imagination_of(env, IMAGINED_RATIO)  # raises now rather than at the first sample
+        if env is not None:
+            self._check_env(env)  # raises now rather than at the first sample
         self.rng = np.random.default_rng(np.random.randint(2**31) if seed is None else seed)
 
         self.original_goals = np.zeros(
@@ -154,13 +156,34 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
     ) -> None:
         """Store one step of every environment; arguments as in HerReplayBuffer.
 
-        An episode whose info says "diverged" at its end is dropped: it is never sampled.
+        A step that does not begin where the last one ended begins another episode: the environment
+        was reset meanwhile. An episode is dropped, so that it is never sampled, whose info says
+        "diverged" at its end, or whose steps were not all stored (`lost_steps`).
 
         Raises:
-            ValueError: an environment returned NaN or infinity; nothing of the step is stored.
+            ValueError: an array has another shape than the environments', or holds NaN or infinity;
+                nothing of the step is stored.
         """
-        check_finite(obs, next_obs, action, reward)
+        with np.errstate(under="ignore"):  # what is too small for float32 is stored as 0
+            self._add(obs, next_obs, action, reward, done, infos)
+
+    def _add(
+        self,
+        obs: dict[str, np.ndarray],
+        next_obs: dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        stores = (self.observations, self.next_observations)
+        check_step(stores, obs, next_obs, action, reward, done, infos, self.action_dim)
         pos = self.pos
+        running = self._current_ep_start != pos
+        if running.any():
+            fits = goes_on(self.next_observations, pos, running, obs)
+            if fits is not None:
+                self.end_episodes(np.flatnonzero(~fits))
         rows = [
             self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
             for env_idx in np.flatnonzero(self.ep_length[pos])
@@ -176,10 +199,54 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         super(HerReplayBuffer, self).add(obs, next_obs, action, reward, done, infos)
         self.n_added += 1
         for env_idx in np.flatnonzero(done):
-            if "diverged" in infos[env_idx]:
+            n_steps = (self.pos - self._current_ep_start[env_idx]) % self.buffer_size
+            if "diverged" in infos[env_idx] or lost_steps(infos[env_idx], n_steps):
                 self._current_ep_start[env_idx] = self.pos
             else:
                 self._compute_episode_length(int(env_idx))
+        if self.full:  # an episode that is as long as the buffer would overwrite itself
+            longest = (self._current_ep_start == self.pos) & ~np.asarray(done, dtype=bool)
+            for env_idx in np.flatnonzero(longest):
+                self._compute_episode_length(int(env_idx))
+
+    def end_episodes(self, env_indices: np.ndarray | None = None) -> None:
+        """End running episodes where they stand, as a time limit would: they are sampled then.
+
+        Args:
+            env_indices: of the environments, by default all, (n,) int.
+        """
+        running = self._current_ep_start != self.pos
+        for env_idx in np.flatnonzero(running) if env_indices is None else env_indices:
+            self._compute_episode_length(int(env_idx))
+
+    def set_env(self, env: VecEnv) -> None:
+        """Ask another environment for rewards and imagined goals from now on.
+
+        Episodes that ran in an earlier one end where they stand. An algorithm of SB3 does not tell
+        its replay buffer of `set_env`; `HerDDPG` and `CurriculumCallback` do.
+
+        Raises:
+            ValueError: it has another number of copies, or lacks what the buffer asks for.
+        """
+        self._check_env(env)
+        if self.env is not None and env is not self.env:
+            self.end_episodes()
+        self.env = env
+
+    def _check_env(self, env: VecEnv) -> None:
+        if env.num_envs != self.n_envs:
+            raise ValueError(
+                f"the replay buffer holds steps of {self.n_envs} environments; this one has "
+                f"{env.num_envs} copies"
+            )
+        if self.imagined_ratio > 0.0:
+            imagination_of(env, IMAGINED_RATIO)
+        asks = self.reward_function is None and self.her_ratio > 0.0
+        if asks and not env.has_attr("compute_reward"):
+            raise ValueError(
+                "hindsight needs an environment with compute_reward(achieved, desired, infos), "
+                "this one has none; or give a reward_function"
+            )
 
     def _forget_episode(self, row: int) -> None:
         """Make an episode that is about to be overwritten invisible to sampling."""
@@ -265,12 +332,17 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
             stores["far"] = self._far
         return stores
 
+    def is_ready(self) -> bool:
+        """Whether an episode has ended, so that there is something to draw from."""
+        return self.table.n_transitions() > 0
+
     def check_ready(self) -> None:
         """Raise RuntimeError while there is nothing to draw from."""
-        if self.table.n_transitions() == 0:
+        if not self.is_ready():
             raise RuntimeError(
-                "the replay buffer holds no finished episode yet; "
-                "set learning_starts to at least one episode of every environment"
+                "the replay buffer holds no finished episode yet: set learning_starts to at least "
+                "one episode of every environment; or, where a loaded model goes on with "
+                "reset_num_timesteps=False, load its replay buffer too"
             )
 
     def moved_share(self) -> float:
@@ -295,6 +367,7 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
 
         Raises:
             RuntimeError: before the end of the first episode.
+            ValueError: rewards or imagined goals of another shape, or not finite.
         """
         return self.sample_with_steps(batch_size, env)[0]
 
@@ -313,6 +386,14 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
             transition until it stood on the hindsight goal; infinite where the goal shown is kept.
         """
         self.check_ready()
+        with np.errstate(under="ignore"):
+            return self._sample_with_steps(batch_size, env, n_batches)
+
+    def _sample_with_steps(
+        self, batch_size: int, env: VecNormalize | None, n_batches: int
+    ) -> tuple[DictReplayBufferSamples, th.Tensor]:
+        if env is not None and self.env is not None and unwrap_vec_normalize(self.env) is not env:
+            self.set_env(env)  # of an algorithm that was given another environment
         if self.selection is not None:
             batch_size *= self.selection.candidates
         row, step = self._draw(batch_size)
@@ -420,7 +501,19 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         # Where no infos are kept, one empty dict does for all.
         infos = list(self._take(self.infos, flat)) if self.copy_info_dict else [{}] * len(flat)
         if self.reward_function is not None:
-            return self.reward_function(achieved, desired, infos)
-        if self.env is None:
+            answer, asked = self.reward_function(achieved, desired, infos), "reward_function"
+        elif self.env is None:
             raise RuntimeError("the replay buffer has no environment: call set_env() after loading")
-        return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
+        else:
+            answer, asked = self._ask(achieved, desired, infos), "the environment's compute_reward"
+        return one_each(answer, len(flat), asked)
+
+    def _ask(self, achieved: np.ndarray, desired: np.ndarray, infos: list[dict[str, Any]]) -> Any:
+        assert self.env is not None
+        try:
+            return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
+        except (OSError, EOFError) as error:
+            raise ValueError(
+                f"the replay buffer's environment does not answer ({error}); after "
+                "model.set_env(env), call model.replay_buffer.set_env(model.env)"
+            ) from error

@@ -111,10 +111,10 @@ class RecordReplayBuffer(HerReplayBuffer):
 
     def _make_room_for(self, obs: dict[str, np.ndarray], next_obs: dict[str, np.ndarray]) -> None:
         """Store desired goals twice from now on if those of a step differ."""
-        if self.goals_are_shared and not np.array_equal(
-            obs["desired_goal"], next_obs["desired_goal"]
-        ):
-            self._share_goals(False)
+        if self.goals_are_shared:
+            goals, later = obs["desired_goal"], next_obs["desired_goal"]
+            if later is not goals and not (later == goals).all():
+                self._share_goals(False)
 
     def bytes_per_transition(self) -> float:
         """Bytes of arrays that a stored transition takes."""
@@ -189,23 +189,3 @@ class RecordReplayBuffer(HerReplayBuffer):
     def _take(self, store: np.ndarray, flat: np.ndarray) -> np.ndarray:
         """Copy of the (slot, environment) entries with the given flat indices."""
         return store.reshape(self.buffer_size * self.n_envs, *store.shape[2:]).take(flat, axis=0)
-
-
-def check_finite(
-    obs: dict[str, np.ndarray],
-    next_obs: dict[str, np.ndarray],
-    action: np.ndarray,
-    reward: np.ndarray,
-) -> None:
-    """Refuse a step of every environment that holds NaN or infinity.
-
-    Raises:
-        ValueError: with what holds it and of which environment.
-    """
-    named = {f"the observation {key!r}": value for key, value in obs.items()}
-    named |= {f"the next observation {key!r}": value for key, value in next_obs.items()}
-    for name, array in {**named, "the action": action, "the reward": reward}.items():
-        finite = np.isfinite(array)
-        if not finite.all():
-            index = np.argwhere(~finite)[0, 0]
-            raise ValueError(f"{name} of environment {index} holds NaN or infinity")
