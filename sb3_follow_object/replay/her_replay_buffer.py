@@ -11,7 +11,6 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from ..common.answers import one_each
 from ..imagination.imagined_goals import imagine
@@ -20,7 +19,7 @@ from ..settings.keywords import check_keywords
 from .cher import GoalSelection
 from .episode_table import EpisodeTable
 from .record_buffer import NEXT_DESIRED, RecordReplayBuffer
-from .steps import check_step, goes_on, lost_steps
+from .steps import lost_steps
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
 GRAVITY = 9.81  # m/s^2
@@ -164,49 +163,39 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
             ValueError: an array has another shape than the environments', or holds NaN or infinity;
                 nothing of the step is stored.
         """
-        with np.errstate(under="ignore"):  # what is too small for float32 is stored as 0
-            self._add(obs, next_obs, action, reward, done, infos)
-
-    def _add(
-        self,
-        obs: dict[str, np.ndarray],
-        next_obs: dict[str, np.ndarray],
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        stores = (self.observations, self.next_observations)
-        check_step(stores, obs, next_obs, action, reward, done, infos, self.action_dim)
         pos = self.pos
-        running = self._current_ep_start != pos
-        if running.any():
-            fits = goes_on(self.next_observations, pos, running, obs)
-            if fits is not None:
-                self.end_episodes(np.flatnonzero(~fits))
         rows = [
             self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
-            for env_idx in np.flatnonzero(self.ep_length[pos])
+            for env_idx in self.ep_length[pos].nonzero()[0]
         ]
         for row in sorted(rows):
             self._forget_episode(row)
-        self._make_room_for(obs, next_obs)
+        # What is too small for float32 becomes 0, what is too large is refused.
+        with np.errstate(under="ignore", over="ignore"):
+            self._write(obs, next_obs, action, reward, done, infos)
+        running = self._current_ep_start != pos
+        if running.any():
+            self.end_episodes(self._broken_off(running))
         self.ep_start[pos] = self._current_ep_start
         if self.copy_info_dict:
             self.infos[pos] = infos
         if self.imagined_ratio > 0.0:
             self.original_goals[pos] = [info["original_goal"] for info in infos]
-        super(HerReplayBuffer, self).add(obs, next_obs, action, reward, done, infos)
+        self.pos = (pos + 1) % self.buffer_size
+        self.full |= self.pos == 0
         self.n_added += 1
-        for env_idx in np.flatnonzero(done):
+        self._end_finished(np.asarray(done, dtype=bool).reshape(self.n_envs), infos)
+
+    def _end_finished(self, done: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """End the episodes that the step ended; drop those that are not to be sampled."""
+        for env_idx in done.nonzero()[0]:
             n_steps = (self.pos - self._current_ep_start[env_idx]) % self.buffer_size
             if "diverged" in infos[env_idx] or lost_steps(infos[env_idx], n_steps):
                 self._current_ep_start[env_idx] = self.pos
             else:
                 self._compute_episode_length(int(env_idx))
-        if self.full:  # an episode that is as long as the buffer would overwrite itself
-            longest = (self._current_ep_start == self.pos) & ~np.asarray(done, dtype=bool)
-            for env_idx in np.flatnonzero(longest):
+        if self.full:  # one that is as long as the buffer would overwrite itself
+            for env_idx in ((self._current_ep_start == self.pos) & ~done).nonzero()[0]:
                 self._compute_episode_length(int(env_idx))
 
     def end_episodes(self, env_indices: np.ndarray | None = None) -> None:
@@ -215,8 +204,9 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         Args:
             env_indices: of the environments, by default all, (n,) int.
         """
-        running = self._current_ep_start != self.pos
-        for env_idx in np.flatnonzero(running) if env_indices is None else env_indices:
+        if env_indices is None:
+            env_indices = np.flatnonzero(self._current_ep_start != self.pos)
+        for env_idx in env_indices:
             self._compute_episode_length(int(env_idx))
 
     def set_env(self, env: VecEnv) -> None:

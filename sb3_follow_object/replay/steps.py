@@ -1,4 +1,4 @@
-"""A step of every environment, looked at before it is stored."""
+"""What a step of every environment must be before it counts as stored."""
 
 from __future__ import annotations
 
@@ -7,94 +7,35 @@ from typing import Any
 
 import numpy as np
 
-Arrays = Mapping[str, np.ndarray]
 
-
-def check_step(
-    stores: tuple[Arrays, Arrays],
-    obs: Arrays,
-    next_obs: Arrays,
-    action: np.ndarray,
-    reward: np.ndarray,
-    done: np.ndarray,
-    infos: list[dict[str, Any]],
-    action_size: int,
-) -> None:
-    """Refuse a step of every environment whose arrays do not fit, or hold NaN or infinity.
-
-    Args:
-        stores: key -> (n_slots, n_envs, ...), of observations and of next observations.
-        obs: key -> (n_envs, ...); whole numbers may lack the last axis, one environment the first.
-        next_obs: the same one step later.
-        action: (n_envs, ...), `action_size` numbers each.
-        reward: (n_envs,).
-        done: (n_envs,).
-        infos: one of each environment.
-        action_size: numbers of an action.
+def fitted(array: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Return an array in a shape that holds as many numbers: nothing is broadcast.
 
     Raises:
-        ValueError: with what is wrong and, for numbers that are not finite, of which environment.
+        ValueError: it holds another number of them.
     """
-    for stored, given, name in zip(stores, (obs, next_obs), _NAMES, strict=True):
-        for key, store in stored.items():
-            shape, array = store.shape[1:], np.asarray(given[key])
-            if np.shape(array) != shape:
-                _check_size(array, shape, f"{name} {key!r}")
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                _refuse(array, len(infos), f"{name} {key!r}")
-    n_envs = store.shape[1]
-    if np.size(action) != n_envs * action_size:
-        _check_size(action, (n_envs, action_size), "the action")
-    for name, array in (("the reward", reward), ("the end of the episode", done)):
-        if np.shape(array) != (n_envs,):
-            _check_size(array, (n_envs,), name)
-    if len(infos) != n_envs:
-        raise ValueError(f"there are {len(infos)} infos for {n_envs} environments")
-    for name, array in (("the action", action), ("the reward", reward)):
-        if not np.isfinite(array).all():
-            _refuse(array, n_envs, name)
-    if np.any(done):
-        for i in np.flatnonzero(done):
-            for key, value in (infos[i].get("terminal_observation") or {}).items():
-                if key in next_obs:
-                    shape = stores[1][key].shape[2:]
-                    if np.shape(value) != shape:
-                        _check_size(value, shape, f"the terminal observation {key!r}")
+    array = np.asarray(array)
+    if array.size != int(np.prod(shape)):
+        raise ValueError(f"{what} has the shape {array.shape}, not {shape}")
+    return array.reshape(shape)
 
 
-_NAMES = ("the observation", "the next observation")
-
-
-def _check_size(array: Any, shape: tuple[int, ...], name: str) -> None:
-    """Refuse an array that would have to be broadcast to a shape."""
-    found = np.shape(array)
-    if int(np.prod(found)) != int(np.prod(shape)):
-        raise ValueError(f"{name} has the shape {found}, not {shape}")
-
-
-def _refuse(array: Any, n_envs: int, name: str) -> None:
-    """Say which environment's numbers are not finite."""
-    index = int(np.flatnonzero(~np.isfinite(np.reshape(array, (n_envs, -1))).all(axis=1))[0])
-    raise ValueError(f"{name} of environment {index} holds NaN or infinity")
-
-
-def goes_on(stored: Arrays, pos: int, running: np.ndarray, obs: Arrays) -> np.ndarray | None:
-    """Which running episodes an observation goes on with (n_envs,); None where it is all of them.
+def refuse_infinite(arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise a ValueError that names the array and the environment of the first bad number.
 
     Args:
-        stored: key -> next observations (n_slots, n_envs, ...).
-        pos: the slot that comes next.
-        running: whether an environment's episode waits for more steps, (n_envs,).
-        obs: that the environments stand at, key -> (n_envs, ...).
+        arrays: what the sentence calls each -> (n_envs, ...).
     """
-    fits = None
-    for key, store in stored.items():
-        last = store[pos - 1]
-        same = np.reshape(obs[key], last.shape).astype(last.dtype, copy=False) == last
-        if not same.all():
-            each = same.reshape(len(running), -1).all(axis=1) | ~running
-            fits = each if fits is None else fits & each
-    return None if fits is None or fits.all() else fits
+    for name, array in arrays.items():
+        finite = np.isfinite(array)
+        if not finite.all():
+            index = np.argwhere(~finite)[0, 0]
+            raise ValueError(f"{name} of environment {index} holds NaN or infinity in float32")
+
+
+def same_bytes(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether arrays hold the same bytes: in a third of the time that `==` and `all` take."""
+    return a.dtype == b.dtype and a.tobytes() == b.tobytes()
 
 
 def lost_steps(info: Mapping[str, Any], n_stored: int) -> bool:
