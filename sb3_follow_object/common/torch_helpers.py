@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import torch as th
 
@@ -28,6 +28,22 @@ def threads_at(n: int | None) -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(earlier)
+
+
+@contextmanager
+def usual_defaults() -> Iterator[None]:
+    """Make float32 tensors on the CPU by default for a while, whatever the process's defaults.
+
+    Networks are built and Adam keeps its counts by these defaults; what they meet is float32.
+    """
+    dtype = th.get_default_dtype()
+    with ExitStack() as stack:
+        if dtype != th.float32:
+            stack.callback(th.set_default_dtype, dtype)
+            th.set_default_dtype(th.float32)
+        if th.get_default_device().type != "cpu":
+            stack.enter_context(th.device("cpu"))
+        yield
 
 
 def lowest(q_values: list[th.Tensor]) -> th.Tensor:
