@@ -281,7 +281,8 @@ class HerDDPG(WholeEpisodesDDPG):
             scaled = np.clip(scaled + noise, -1.0, 1.0)
             random = self.rng.random(n_envs) < self.random_action_prob
             scaled[random] = self.rng.uniform(-1.0, 1.0, size=(random.sum(), *scaled.shape[1:]))
-        scaled = scaled.astype(np.float32)
+        with np.errstate(under="ignore"):
+            scaled = scaled.astype(np.float32)
         return self.policy.unscale_action(scaled), scaled
 
     def _update_moments(self) -> None:

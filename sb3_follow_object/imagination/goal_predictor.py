@@ -16,6 +16,7 @@ from stable_baselines3.common.utils import get_device
 from torch import nn
 
 from ..common.files import atomic_write
+from ..common.torch_helpers import usual_defaults
 from .predictor_files import (
     FACTS_FILE,
     FORMAT,
@@ -70,7 +71,8 @@ class GoalPredictor:
         self.error_mm = error_mm
         self.device = torch.device("cpu")
         self._tensors = tensors
-        self._network = _network(self.hidden)
+        with usual_defaults():
+            self._network = _network(self.hidden)
         self._network.load_state_dict(
             {name: value for name, value in tensors.items() if name not in SCALES}
         )
@@ -79,6 +81,7 @@ class GoalPredictor:
         self._scales = {name: tensors[name].numpy().copy() for name in SCALES}
 
     @classmethod
+    @usual_defaults()
     def fit(
         cls,
         paths: np.ndarray,
@@ -226,9 +229,11 @@ class GoalPredictor:
                 f"k must lie in 1..{self.horizon}, got values from {k.min()} to {k.max()}."
             )
         inputs = np.concatenate([start, goal, k[:, None]], axis=1, dtype=np.float64)
-        scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
+        with np.errstate(under="ignore"):
+            scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
+            scaled = scaled.astype(np.float32)
         with torch.inference_mode():
-            on = torch.from_numpy(scaled.astype(np.float32)).to(self.device)
+            on = torch.from_numpy(scaled).to(self.device)
             outputs = self._network(on).cpu().numpy()
         return outputs * self._scales["output_std"] + self._scales["output_mean"]
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.torch_layers import create_mlp, get_actor_critic_a
 from torch import nn
 
 from ..common.array_trees import load_tree, save_tree
-from ..common.torch_helpers import lowest
+from ..common.torch_helpers import lowest, usual_defaults
 from ..ddpg.her_ddpg import HerDDPG
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
 from ..imagination.predictor_files import valid_hidden
@@ -64,7 +64,8 @@ class ObjectNetworks(nn.Module):
             "clip": clip,
         }
         self.inverse_error = float("nan")
-        with th.random.fork_rng(devices=[]):  # what is drawn here is replaced
+        # What is drawn here is replaced.
+        with usual_defaults(), th.random.fork_rng(devices=[]):
             policy = HerPolicy(
                 _dict_space(),
                 spaces.Box(-1.0, 1.0, (ACTION,), np.float32),
@@ -141,7 +142,8 @@ class ObjectNetworks(nn.Module):
         networks.nu.load_state_dict(model.actor.mu.state_dict())
         for copy, critic in zip(networks.critics, model.critic.q_networks, strict=True):
             copy.load_state_dict(critic.state_dict())
-        networks._fit_inverse(model, learning_rate, batch_size, updates, seed, between_updates)
+        with usual_defaults():
+            networks._fit_inverse(model, learning_rate, batch_size, updates, seed, between_updates)
         return networks
 
     @staticmethod

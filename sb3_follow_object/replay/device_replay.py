@@ -153,7 +153,7 @@ class DeviceReplay:
         n_slots, n_envs, width = records.array.shape
         return th.zeros((n_slots * n_envs, width), dtype=th.float32, device=self.device)
 
-    def refresh(self, buffer: FollowObjectReplayBuffer) -> None:
+    def refresh(self, buffer: Any) -> None:
         """Take over what the buffer holds; it and its environment may be others than before.
 
         Raises:

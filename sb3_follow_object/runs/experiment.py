@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import torch as th
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.vec_env import VecEnv
@@ -21,6 +20,7 @@ from ..callbacks.rollout import Episodes, run_episodes
 from ..common.files import atomic_write, lock, remove_half_written
 from ..common.reports import Report, Trouble
 from ..common.seeds import stream_seed
+from ..common.torch_helpers import threads_at
 from ..ddpg.actor_files import load_actor
 from ..envs import make_vec
 from ..follow_object.follow_object import FollowObject
@@ -93,7 +93,7 @@ def train(
             remove_half_written(folder)
         else:
             check_empty(folder)
-        th.set_num_threads(1)  # nothing but the robot's gradient steps gains from more
+        stack.enter_context(threads_at(1))  # only the robot's gradient steps gain from more
         stop = stack.enter_context(StopSignals())
         run = FollowObject(
             config.env_id,
