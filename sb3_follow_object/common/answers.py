@@ -44,7 +44,7 @@ def one_number(answer: Any, what: str) -> float:
 
 def check_shape(array: Any, shape: tuple[int, ...], what: str) -> None:
     """Raise a ValueError unless an array has this shape."""
-    found = np.shape(array)
+    found = tuple(np.shape(array))
     if found != shape:
         raise ValueError(f"{what} must have the shape {shape}, not {found}")
 

@@ -12,6 +12,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from ..common.torch_helpers import usual_defaults
 from ..replay.following import check_size, end_running_episodes, follow_env
+from ..replay.her_replay_buffer import FollowObjectReplayBuffer
 
 
 class WholeEpisodesDDPG(DDPG):
@@ -40,10 +41,13 @@ class WholeEpisodesDDPG(DDPG):
         """Go on in another environment, as in SB3; the replay buffer asks it from now on.
 
         Raises:
-            ValueError: it is in VecNormalize, or not one that the auxiliary reward was made for.
+            ValueError: it is in VecNormalize, not one that the auxiliary reward was made for, or
+                lacks what the replay buffer asks for; nothing is changed then.
         """
         env = self._wrap_env(env, self.verbose)
         self._check_env(env)
+        if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
+            self.replay_buffer.check_env(env)
         super().set_env(env, force_reset)
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()

@@ -108,9 +108,9 @@ class DeviceReplay:
 
     def __init__(self, buffer: FollowObjectReplayBuffer, device: th.device, seed: int) -> None:
         self.device = device
-        self.generator = th.Generator(device).manual_seed(seed)
         self._env: VecEnv | None = None
         self._take(buffer)
+        self.generator = th.Generator(device).manual_seed(seed)
         self._lists: dict[bool, tuple[Any, th.Tensor, th.Tensor]] = {}
 
     def _take(self, buffer: FollowObjectReplayBuffer) -> None:

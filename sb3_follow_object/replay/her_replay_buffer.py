@@ -130,7 +130,7 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
                 f"have {goal_shape[-1]}: take 'uniform'"
             )
         if env is not None:
-            self._check_env(env)  # raises now rather than at the first sample
+            self.check_env(env)  # raises now rather than at the first sample
         self.rng = np.random.default_rng(np.random.randint(2**31) if seed is None else seed)
 
         self.original_goals = np.zeros(
@@ -218,12 +218,13 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         Raises:
             ValueError: it has another number of copies, or lacks what the buffer asks for.
         """
-        self._check_env(env)
+        self.check_env(env)
         if self.env is not None and env is not self.env:
             self.end_episodes()
         self.env = env
 
-    def _check_env(self, env: VecEnv) -> None:
+    def check_env(self, env: VecEnv) -> None:
+        """Raise a ValueError for an environment that `set_env` refuses."""
         if env.num_envs != self.n_envs:
             raise ValueError(
                 f"the replay buffer holds steps of {self.n_envs} environments; this one has "
