@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 import torch as th
+
+_PROCESS = os.getpid()  # in a process forked from this one another number
 
 
 @contextmanager
@@ -31,13 +34,25 @@ def threads_at(n: int | None) -> Iterator[None]:
 
 
 @contextmanager
+def fork_safe() -> Iterator[None]:
+    """Use one thread for a while in a forked process, which has none of its parent's threads.
+
+    OpenMP does not know that and would wait for them without end.
+    """
+    with ExitStack() as stack:
+        if os.getpid() != _PROCESS:
+            stack.enter_context(threads_at(1))
+        yield
+
+
+@contextmanager
 def usual_defaults() -> Iterator[None]:
     """Make float32 tensors on the CPU by default for a while, whatever the process's defaults.
 
     Networks are built and Adam keeps its counts by these defaults; what they meet is float32.
     """
     dtype = th.get_default_dtype()
-    with ExitStack() as stack:
+    with fork_safe(), ExitStack() as stack:
         if dtype != th.float32:
             stack.callback(th.set_default_dtype, dtype)
             th.set_default_dtype(th.float32)

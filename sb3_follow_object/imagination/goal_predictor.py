@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import get_device
 from torch import nn
 
 from ..common.files import atomic_write
-from ..common.torch_helpers import usual_defaults
+from ..common.torch_helpers import fork_safe, usual_defaults
 from .predictor_files import (
     FACTS_FILE,
     FORMAT,
@@ -232,7 +232,7 @@ class GoalPredictor:
         with np.errstate(under="ignore"):
             scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
             scaled = scaled.astype(np.float32)
-        with torch.inference_mode():
+        with fork_safe(), torch.inference_mode():
             on = torch.from_numpy(scaled).to(self.device)
             outputs = self._network(on).cpu().numpy()
         return outputs * self._scales["output_std"] + self._scales["output_mean"]

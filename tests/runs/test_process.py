@@ -25,7 +25,6 @@ from sb3_follow_object import HerPolicy, load_actor, save_actor
 from sb3_follow_object.ddpg.layer_norm import LayerNorm
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
-from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
 from sb3_follow_object.object_stage.networks import ObjectNetworks
 from sb3_follow_object.runs.run_callbacks import StopSignals
 
@@ -222,24 +221,23 @@ def test_stop_signals_leave_the_handlers_as_they_were() -> None:
     run_in_thread(lambda: StopSignals().__enter__().__exit__())
 
 
-def imagining() -> ImaginedGoalWrapper:
-    paths, goals = toy.paths(20)
-    made = GoalPredictor.fit(paths, goals, env_id="x", physics="y", hidden=(64, 64), epochs=1)
-    return ImaginedGoalWrapper(toy.PointEnv(), made, toy.curriculum(p=0.0))
-
-
-@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
-def test_every_start_method_of_processes(method: str) -> None:
-    script = f"""
+SCRIPT = """
 import sys
-sys.path[:0] = [{str(ROOT / "tests" / "support")!r}, {str(ROOT / "tests" / "runs")!r}]
-import numpy as np, torch as th
-from test_process import imagining
+sys.path.insert(0, {support!r})
+import numpy as np, torch as th, toy
 from stable_baselines3.common.vec_env import SubprocVecEnv
+from sb3_follow_object import GoalPredictor, ImaginedGoalWrapper
+
 if __name__ == "__main__":
     th.set_num_threads(2)
-    th.randn(2000, 2000) @ th.randn(2000, 2000)  # the parent's threads have worked
-    env = SubprocVecEnv([imagining] * 2, start_method={method!r})
+    th.randn(1000, 1000) @ th.randn(1000, 1000)  # the parent's threads have worked
+    paths, goals = toy.paths(20)
+    made = GoalPredictor.fit(
+        paths, goals, env_id="x", physics="y", hidden=(512, 512, 512), epochs=1
+    )
+    levels = toy.curriculum(p=0.0, levels="path")
+    wrapped = lambda: ImaginedGoalWrapper(toy.PointEnv(), made, levels)
+    env = SubprocVecEnv([wrapped] * 2, start_method={method!r})
     env.seed(0)
     env.reset()
     for _ in range(25):
@@ -247,4 +245,10 @@ if __name__ == "__main__":
     assert np.isfinite(obs["desired_goal"]).all()
     env.close()
 """
-    run([sys.executable, "-c", script], timeout=300, env={**os.environ, "OMP_NUM_THREADS": "2"})
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+def test_goals_are_imagined_in_processes_of_every_start_method(method: str) -> None:
+    script = SCRIPT.format(support=str(ROOT / "tests" / "support"), method=method)
+    threads = {**os.environ, "OMP_NUM_THREADS": "2"}
+    run([sys.executable, "-c", script], timeout=120, env=threads)
