@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-import warnings
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped, unwrap_vec_wrapper
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from ..ddpg.whole_episodes import WholeEpisodesDDPG
 from ..imagination.curriculum import Curriculum
 from ..imagination.vec_env import ImaginedGoalVecEnv, imagination_of
+from ..replay.following import (
+    check_size,
+    end_running_episodes,
+    episodes_are_whole,
+    follow_env,
+)
 from ..settings.stages import CurriculumTestSettings
 from .copyable import CopyableCallback
 from .env_copies import copies_for_tests
@@ -63,13 +69,15 @@ class CurriculumCallback(CopyableCallback):
                 raise ValueError("test_env must be an ImaginedGoalVecEnv with mode='test'.")
         settings = CurriculumTestSettings(n_episodes=n_episodes, every=every, store=store)
         self._test_env = test_env
+        self._copied: VecEnv | None = None  # the training's, where the test's is a copy of it
         self.n_episodes = settings.n_episodes
         self.every = settings.every
         self.store = settings.store
         self.test_steps = 0
         self._cycles = 0
         self._episode_ended = False
-        self._started = False
+        self._is_training = False
+        self._trained: BaseAlgorithm | None = None  # the model that training began with last
 
     @property
     def test_env(self) -> VecEnv:
@@ -98,18 +106,57 @@ class CurriculumCallback(CopyableCallback):
         self._episode_ended = bool(state["episode_ended"])
 
     def _on_training_start(self) -> None:
-        if self._test_env is None:
-            self._test_env = copies_for_tests(self.training_env)
+        self._follow_training_env()
+        if self._is_training and self.model.num_timesteps > 0:
+            self._begin_new_episodes()
+        self._is_training = True
+        another = self._trained is not self.model
+        if self._trained is not None and self.model.num_timesteps == 0:
+            self.test_steps = 0  # counted anew, as SB3 does its steps unless told otherwise
+            self._cycles, self._episode_ended = 0, False
+        if another and hasattr(self.model, "curriculum_state"):
+            self.curriculum.load_state_dict(self.model.curriculum_state)
+        self._trained = self.model
+        self._share_curriculum()
+
+    def _follow_training_env(self) -> None:
+        """Let the tests and the replay buffer have what training has, whatever was replaced."""
+        is_copy = self._copied is not None
+        if self._test_env is None or (is_copy and self._copied is not self.training_env):
+            if self._test_env is not None:
+                self._test_env.close()
+            self._test_env, self._copied = copies_for_tests(self.training_env), self.training_env
             # NumPy's global stream is the one that SB3 seeds.
             self._test_env.seed(int(np.random.randint(2**31 - 1000)))
+        elif is_copy and is_vecenv_wrapped(self._test_env, ImaginedGoalVecEnv):
+            imagined = unwrap_vec_wrapper(self._test_env, ImaginedGoalVecEnv)
+            assert imagined is not None
+            imagination = imagination_of(self.training_env, "CurriculumCallback")
+            imagined.predictor, imagined.curriculum = imagination
         else:
             _check_curriculum(self.training_env, self.curriculum)
-        if self._started and self.model.num_timesteps == 0:
-            self.test_steps = 0  # counted anew, as SB3 does its steps unless told otherwise
-        if not self._started and hasattr(self.model, "curriculum_state"):
-            self.curriculum.load_state_dict(self.model.curriculum_state)
-        self._started = True
-        self._share_curriculum()
+        buffer = getattr(self.model, "replay_buffer", None)
+        if buffer is not None:
+            check_size(buffer, self.training_env)
+            follow_env(buffer, self.training_env)
+
+    def _begin_new_episodes(self) -> None:
+        """Reset the environment after an exception: who knows what step it stands at."""
+        model: Any = self.model
+        if isinstance(model, WholeEpisodesDDPG):
+            return  # it knows
+        model._last_obs = self.training_env.reset()
+        model._last_episode_starts = np.ones(self.training_env.num_envs, dtype=bool)
+        normaliser = model.get_vec_normalize_env()
+        if normaliser is not None:
+            model._last_original_obs = normaliser.get_original_obs()
+
+    def _on_training_end(self) -> None:
+        # Where another callback stopped the training in the middle of a step, SB3 does not store it
+        # and would go on from the observation before it; without one it resets the environment.
+        model, self._is_training = cast(Any, self.model), False
+        if model._last_obs is not self.locals.get("new_obs", model._last_obs):
+            model._last_obs = None
 
     def _on_step(self) -> bool:
         self._episode_ended |= bool(np.any(self.locals["dones"]))
@@ -126,16 +173,20 @@ class CurriculumCallback(CopyableCallback):
 
     def _test(self) -> None:
         buffer = self._open_buffer()
-        episodes = run_episodes(
-            noise_free(self.model, learning=True),
-            self.test_env,
-            self.n_episodes or self.test_env.num_envs,
-            on_step=None if buffer is None else self._storing(buffer),
-        )
-        if isinstance(buffer, HerReplayBuffer):
-            _close_episodes(buffer)
+        try:
+            episodes = run_episodes(
+                noise_free(self.model, learning=True),
+                self.test_env,
+                self.n_episodes or self.test_env.num_envs,
+                on_step=None if buffer is None else self._storing(buffer),
+            )
+        finally:  # those still running too, so that training starts its own
+            end_running_episodes(buffer)
         self.test_steps += episodes.env_steps
-        self.model.num_timesteps += episodes.env_steps  # tests cost steps like any others
+        model = self.model
+        model.num_timesteps += episodes.env_steps  # tests cost steps like any others
+        # A rollout's end may lie beyond the last step; schedules end at 0.
+        model._current_progress_remaining = max(0.0, model._current_progress_remaining)
         self.logger.record("curriculum/test_success", episodes.success_rate)
         if self.curriculum.report(episodes.success_rate):
             self._share_curriculum()
@@ -157,9 +208,7 @@ class CurriculumCallback(CopyableCallback):
         buffer = getattr(self.model, "replay_buffer", None)
         if not self.store or buffer is None or self.test_env.num_envs != buffer.n_envs:
             return None
-        if isinstance(buffer, HerReplayBuffer) and (buffer._current_ep_start != buffer.pos).any():
-            return None
-        return buffer
+        return buffer if episodes_are_whole(buffer) else None
 
     def _storing(self, buffer: Any) -> OnStep:
         continuous = isinstance(self.model.action_space, spaces.Box)
@@ -185,10 +234,3 @@ def _check_curriculum(training_env: VecEnv, curriculum: Curriculum) -> None:
     # Wrappers of single environments have copies of it, which are told of every change.
     if is_vecenv_wrapped(training_env, ImaginedGoalVecEnv) and theirs is not curriculum:
         raise ValueError("test_env must have the Curriculum object that the training has.")
-
-
-def _close_episodes(buffer: HerReplayBuffer) -> None:
-    """End test episodes that were still running, so that training starts its own."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it warns of just what is wanted here
-        buffer.truncate_last_trajectory()

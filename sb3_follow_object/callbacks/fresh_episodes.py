@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from ..replay.following import end_running_episodes, episodes_are_whole
 
 
 class FreshEpisodes(BaseCallback):
@@ -29,7 +30,7 @@ class FreshEpisodes(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         assert isinstance(self.model, OffPolicyAlgorithm)
-        if episodes_are_whole(self.model):
+        if episodes_are_whole(self.model.replay_buffer):
             self.training_env.seed(self.seed(self.model.num_timesteps))
             self.model._last_obs = self.training_env.reset()  # type: ignore[assignment]
 
@@ -37,13 +38,4 @@ class FreshEpisodes(BaseCallback):
 def begin_new_episodes(model: OffPolicyAlgorithm) -> None:
     """Drop the episodes that were running; `learn` then resets the environment."""
     model._last_obs = None
-    if not episodes_are_whole(model):
-        model.replay_buffer.truncate_last_trajectory()  # type: ignore[union-attr]
-
-
-def episodes_are_whole(model: OffPolicyAlgorithm) -> bool:
-    """Whether no episode in the replay buffer waits for its end."""
-    buffer: Any = model.replay_buffer
-    return not hasattr(buffer, "_current_ep_start") or bool(
-        (buffer._current_ep_start == buffer.pos).all()
-    )
+    end_running_episodes(model.replay_buffer)

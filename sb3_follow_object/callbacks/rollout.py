@@ -10,8 +10,10 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..common.answers import check_shape, one_each, one_number
 from ..common.numbers import checked_whole
 from ..ddpg.her_ddpg import HerDDPG
+from ..imagination.goal_env import terminal_observation
 
 Observation = dict[str, np.ndarray]
 Policy = Callable[[Observation], np.ndarray]
@@ -54,7 +56,8 @@ def with_terminal_observations(
         return obs
     obs = {key: value.copy() for key, value in obs.items()}
     for i in np.flatnonzero(dones):
-        for key, value in infos[i]["terminal_observation"].items():
+        for key, value in terminal_observation(infos[i]).items():
+            check_shape(value, obs[key][i].shape, f"the terminal observation {key!r}")
             obs[key][i] = value
     return obs
 
@@ -75,7 +78,8 @@ def run_episodes(
             next_obs holds the terminal observation of the copies that are done.
 
     Raises:
-        ValueError: if `n_episodes` is below 1 or an episode ends without saying `is_success`.
+        ValueError: if `n_episodes` is below 1, an episode ends without saying `is_success`, or an
+            array has another shape than that of the environment's copies.
         RuntimeError: more than `n_episodes` episodes diverged.
     """
     n_episodes = checked_whole("n_episodes", n_episodes, 1)
@@ -89,9 +93,10 @@ def run_episodes(
     obs = venv.reset()
     while (finished < wanted).any():
         actions = policy(obs)  # type: ignore[arg-type]
+        check_shape(actions, (n_envs, *venv.action_space.shape), "the policy's actions")  # type: ignore[misc]
         new_obs, rewards, dones, infos = venv.step(actions)
         env_steps += n_envs
-        returns_so_far += rewards
+        returns_so_far += one_each(rewards, n_envs, "the environment's step")
         if on_step is not None:
             next_obs = with_terminal_observations(new_obs, dones, infos)  # type: ignore[arg-type]
             on_step(obs, actions, rewards, dones, infos, next_obs)  # type: ignore[arg-type]
@@ -109,7 +114,7 @@ def run_episodes(
                         "the environment's info has no 'is_success' at the end of an episode; "
                         "success rates need an environment that reports it"
                     )
-                success.append(bool(infos[i]["is_success"]))
+                success.append(bool(one_number(infos[i]["is_success"], "is_success in the info")))
                 returns.append(returns_so_far[i])
                 finished[i] += 1
             returns_so_far[i] = 0.0

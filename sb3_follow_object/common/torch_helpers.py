@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from typing import Any
 
@@ -68,6 +68,22 @@ def one_thread_after_forks() -> None:
     """
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=lambda: th.set_num_threads(1))
+
+
+@contextmanager
+def usual_defaults() -> Iterator[None]:
+    """Make float32 tensors on the CPU by default for a while, whatever the process's defaults.
+
+    Networks are built and Adam keeps its counts by these defaults; what they meet is float32.
+    """
+    dtype = th.get_default_dtype()
+    with ExitStack() as stack:
+        if dtype != th.float32:
+            stack.callback(th.set_default_dtype, dtype)
+            th.set_default_dtype(th.float32)
+        if th.get_default_device().type != "cpu":
+            stack.enter_context(th.device("cpu"))
+        yield
 
 
 def lowest(q_values: list[th.Tensor]) -> th.Tensor:

@@ -11,6 +11,7 @@ from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from ..common.array_trees import load_tree, save_tree
+from ..common.torch_helpers import usual_defaults
 from .policies import NormalizedGoalExtractor
 
 # Activation functions that a policy's file may name.
@@ -64,17 +65,19 @@ def load_actor(
         clip, activation = float(saved.get("clip", 5.0)), saved.get("activation", "ReLU")
         if not clip > 0.0:
             raise ValueError(f"its inputs are clipped at {clip}")
-        extractor = NormalizedGoalExtractor(observation_space, clip)
+        with usual_defaults():
+            extractor = NormalizedGoalExtractor(observation_space, clip)
         widths = [extractor.features_dim, *saved["net_arch"], *action_space.shape]
         _check_layers(saved["actor"], widths)  # before anything of their size is allocated
-        actor = Actor(
-            observation_space,
-            action_space,
-            saved["net_arch"],
-            extractor,
-            extractor.features_dim,
-            _ACTIVATIONS[activation],
-        )
+        with usual_defaults():
+            actor = Actor(
+                observation_space,
+                action_space,
+                saved["net_arch"],
+                extractor,
+                extractor.features_dim,
+                _ACTIVATIONS[activation],
+            )
         actor.load_state_dict(saved["actor"])
         actor.set_training_mode(False)
         return actor, str(saved["env_id"])

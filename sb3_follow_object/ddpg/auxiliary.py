@@ -11,6 +11,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
+from ..common.answers import check_shape
 from ..common.providers import provider
 from ..common.torch_helpers import WholeModule, lowest, matmul_at
 from ..settings.fields import check_names
@@ -149,7 +150,7 @@ class AuxiliaryCritic(WholeModule):
         low, high = self.bounds
         with th.no_grad():
             with matmul_at("highest"):  # rewards are small differences of large values
-                reward = self.reward(batch)
+                reward = self._checked(self.reward(batch), len(batch.actions))
             next_q = lowest([net(next_in) for net in self.target_networks])
             target_q = (reward + (1.0 - dones) * self.gamma * next_q).clamp_(low, high)
         loss = th.stack(
@@ -160,6 +161,12 @@ class AuxiliaryCritic(WholeModule):
         self.optimizer.step()
         self.reward.update(batch)
         self._log(reward=reward.mean(), critic_loss=loss.detach())
+
+    def _checked(self, reward: Any, n: int) -> th.Tensor:
+        """Refuse what would be broadcast."""
+        check_shape(reward, (n, 1), f"the rewards of {type(self.reward).__name__}.forward")
+        assert isinstance(reward, th.Tensor)
+        return reward
 
     def value(self, critic_in: th.Tensor) -> th.Tensor:
         """Return the weighted mean value of actions, for the actor to maximise."""

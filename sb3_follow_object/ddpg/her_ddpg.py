@@ -8,7 +8,6 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import DDPG
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -21,19 +20,21 @@ from stable_baselines3.common.type_aliases import (
     TrainFreq,
     TrainFrequencyUnit,
 )
-from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from ..common.answers import check_shape
 from ..common.copies import WholeCopies
 from ..common.numbers import checked_whole
-from ..common.torch_helpers import matmul_at, threads_at
-from ..replay.device_replay import device_replay_of
+from ..common.torch_helpers import matmul_at, threads_at, usual_defaults
+from ..replay.device_replay import DeviceReplay, device_replay_of
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
 from ..settings.learning import AlgorithmSettings
 from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
 from .input_moments import InputMoments
 from .policies import HerPolicy
 from .updates import COLUMNS, Updates
+from .whole_episodes import WholeEpisodesDDPG
 
 SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 
@@ -43,7 +44,7 @@ _SAMPLE_CHUNK = 32_768
 _DEVICE_CHUNK = 262_144
 
 
-class HerDDPG(WholeCopies, DDPG):
+class HerDDPG(WholeCopies, WholeEpisodesDDPG):
     """DDPG as the HER papers run it: normaliser, target clip, action L2, random actions.
 
     The differences from SB3's DDPG (section 3.2 of the paper and its references):
@@ -218,30 +219,24 @@ class HerDDPG(WholeCopies, DDPG):
             )
         if self.gamma is None:
             self.gamma = 1.0 - 1.0 / self._horizon()
-        if self._vec_normalize_env is not None:
-            raise ValueError(
-                "HerDDPG standardises its inputs itself and knows the range of its rewards; leave "
-                "VecNormalize (rl_zoo3's normalize) out"
-            )
-        if self.env is not None and is_vecenv_wrapped(self.env, VecFrameStack):
-            raise ValueError(
-                "VecFrameStack (rl_zoo3's frame_stack) stacks goals too, for which the environment "
-                "has no reward; leave it out"
-            )
+        self._check_env(self.env)
         if self.auxiliary is not None:
             self.auxiliary = resolve_auxiliary(self.auxiliary, self.env)
         super()._setup_model()
         self.rng = np.random.default_rng(np.random.randint(2**31))
         if not hasattr(self, "moments"):  # SB3's load() brings them before it comes here
             self.moments = InputMoments(self.actor.features_dim)
+        elif self.replay_buffer is not None:
+            self.moments.begin_anew(self.replay_buffer)
         if self.auxiliary is not None:
             # Last, so that what is drawn above does not depend on it.
             rate = self.lr_schedule(1.0)
-            self.auxiliary_critic = make_auxiliary(self.auxiliary, self.policy, rate, self.gamma)
+            with usual_defaults():
+                self.auxiliary_critic = make_auxiliary(
+                    self.auxiliary, self.policy, rate, self.gamma
+                )
         self._updates = Updates(self)
-        self._device_replay = device_replay_of(
-            self.replay_buffer, self.device, self.replay_on_device
-        )
+        self._device_replay = self._make_device_replay()
         if isinstance(self.train_freq, TrainFreq) and (
             self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1
         ):
@@ -252,6 +247,33 @@ class HerDDPG(WholeCopies, DDPG):
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
             self.replay_buffer.check_size()  # before the first step rather than after it
         return super()._setup_learn(*args, **kwargs)
+
+    def _make_device_replay(self) -> DeviceReplay | None:
+        if self.replay_buffer is None:  # loaded to act
+            return None
+        return device_replay_of(self.replay_buffer, self.device, self.replay_on_device)
+
+    def _check_env(self, env: Any) -> None:
+        if env is None:
+            return
+        if unwrap_vec_normalize(env) is not None:
+            raise ValueError(
+                "HerDDPG standardises its inputs itself and knows the range of its rewards; leave "
+                "VecNormalize (rl_zoo3's normalize) out"
+            )
+        if is_vecenv_wrapped(env, VecFrameStack):
+            raise ValueError(
+                "VecFrameStack (rl_zoo3's frame_stack) stacks goals too, for which the environment "
+                "has no reward; leave it out"
+            )
+        if self.auxiliary is not None:
+            resolve_auxiliary(self.auxiliary, env)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:  # noqa: D102
+        makes_replay = self.replay_buffer is None
+        super().set_env(env, force_reset)
+        if makes_replay:
+            self._device_replay = self._make_device_replay()
 
     def _horizon(self) -> int:
         """Steps of an episode, from the environment's spec."""
@@ -272,20 +294,23 @@ class HerDDPG(WholeCopies, DDPG):
     ) -> tuple[np.ndarray, np.ndarray]:
         assert self._last_obs is not None
         assert isinstance(self.action_space, spaces.Box)
+        self._step_is_open = True
         if self.num_timesteps < learning_starts:
             scaled = self.rng.uniform(-1.0, 1.0, size=(n_envs, *self.action_space.shape))
         else:
             action, _ = self.actor.predict(self._last_obs, deterministic=True)
             scaled = self.policy.scale_action(action)
-            noise = (
-                self.rng.normal(0.0, self.noise_std, size=scaled.shape)
-                if action_noise is None
-                else action_noise()
-            )
+            if action_noise is None:
+                noise = self.rng.normal(0.0, self.noise_std, size=scaled.shape)
+            else:
+                noise = np.asarray(action_noise())
+                noise = noise[None] if n_envs == 1 and noise.ndim == 1 else noise
+                check_shape(noise, scaled.shape, "action_noise")
             scaled = np.clip(scaled + noise, -1.0, 1.0)
             random = self.rng.random(n_envs) < self.random_action_prob
             scaled[random] = self.rng.uniform(-1.0, 1.0, size=(random.sum(), *scaled.shape[1:]))
-        scaled = scaled.astype(np.float32)
+        with np.errstate(under="ignore"):
+            scaled = scaled.astype(np.float32)
         return self.policy.unscale_action(scaled), scaled
 
     def _update_moments(self) -> None:
@@ -297,14 +322,8 @@ class HerDDPG(WholeCopies, DDPG):
                 th.as_tensor(self.moments.std, dtype=th.float32),
             )
 
-    def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
-        """Load a replay buffer as SB3 does.
-
-        Where the model has moments of its inputs already, they are those of what it loads.
-        """
-        super().load_replay_buffer(path, truncate_last_traj)
-        assert self.replay_buffer is not None
-        self.moments.buffer_was_loaded(self.replay_buffer)
+    def _buffer_was_replaced(self, buffer: ReplayBuffer) -> None:
+        self.moments.buffer_was_loaded(buffer)
 
     def __getstate__(self) -> dict[str, Any]:
         state = vars(self).copy()
@@ -346,7 +365,7 @@ class HerDDPG(WholeCopies, DDPG):
             "device_rng": None
             if self._device_replay is None
             else self._device_replay.generator.get_state(),
-            "last_obs": self._last_obs,
+            "last_obs": None if self._step_is_open else self._last_obs,
             "counters": {name: getattr(self, name) for name in self._COUNTERS},
         }
 
@@ -382,8 +401,15 @@ class HerDDPG(WholeCopies, DDPG):
         return float(low), float(high)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Take gradient steps; several batches are drawn from the buffer in one call."""
-        with matmul_at(self.matmul_precision), threads_at(self.update_threads):
+        """Take gradient steps; several batches are drawn from the buffer in one call.
+
+        None before the first episode has ended, as after loading a model without its replay.
+        """
+        self._follow()
+        buffer = self.replay_buffer
+        if isinstance(buffer, FollowObjectReplayBuffer) and not buffer.is_ready():
+            return
+        with usual_defaults(), matmul_at(self.matmul_precision), threads_at(self.update_threads):
             self._train(gradient_steps, batch_size)
 
     def _train(self, gradient_steps: int, batch_size: int) -> None:
@@ -428,7 +454,6 @@ class HerDDPG(WholeCopies, DDPG):
         """Upload what is new; where that turns out to be impossible, go on on the host."""
         if self._device_replay is None:
             return
-        assert isinstance(self.replay_buffer, FollowObjectReplayBuffer)
         try:
             self._device_replay.refresh(self.replay_buffer)
         except ValueError as error:
@@ -468,7 +493,7 @@ class HerDDPG(WholeCopies, DDPG):
                 return self._device_replay.sample_with_steps(n)
             return buffer.sample_with_steps(n, n_batches=n_batches)
         data = buffer.sample(n)
-        return data, th.full((n, 1), th.inf, device=self.device)
+        return data, th.full((n, 1), th.inf, dtype=th.float32, device=self.device)
 
     def _trained_parameters(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
         """Parameters of the live and of the target networks, in the same order."""

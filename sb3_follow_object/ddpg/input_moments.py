@@ -42,12 +42,17 @@ class InputMoments(RunningMeanStd):
         self._pos, self._added = buffer.pos, added
         if new == 0:
             return False
+        with np.errstate(under="ignore"):
+            self._take_rows(buffer, new)
+        return True
+
+    def _take_rows(self, buffer: ReplayBuffer, new: int) -> None:
+        """Take in the last `new` time-steps."""
         rows = (buffer.pos - new + np.arange(new)) % buffer.buffer_size
         obs = buffer.observations["observation"][rows].reshape(new * buffer.n_envs, -1)
         for key in ("desired_goal", "achieved_goal"):
             goals = buffer.next_observations[key][rows].reshape(len(obs), -1)
             self.update(np.concatenate([obs, goals], axis=1).astype(np.float64))
-        return True
 
     def begin_anew(self, buffer: ReplayBuffer) -> None:
         """Take in from now on what an empty buffer is given, in addition to what has been."""

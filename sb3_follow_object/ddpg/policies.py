@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from ..common.torch_helpers import WholeModule, one_thread_after_forks
+from ..common.torch_helpers import WholeModule, one_thread_after_forks, usual_defaults
 from ..settings.learning import PolicySettings
 from .layer_norm import LayerNorm
 
@@ -97,16 +97,26 @@ class HerPolicy(WholeModule, TD3Policy):
                 "HerPolicy brings its own features extractor; leave features_extractor_class out"
             )
         self.critic_layer_norm = critic_layer_norm
-        super().__init__(
-            observation_space,
-            action_space,
-            lr_schedule,
-            net_arch=[256, 256, 256] if net_arch is None else net_arch,
-            features_extractor_class=NormalizedGoalExtractor,
-            features_extractor_kwargs={"clip": features_clip},
-            optimizer_kwargs=optimizer_kwargs,
-            **kwargs,
-        )
+        self.features_clip = features_clip
+        with usual_defaults():
+            super().__init__(
+                observation_space,
+                action_space,
+                lr_schedule,
+                net_arch=[256, 256, 256] if net_arch is None else net_arch,
+                features_extractor_class=NormalizedGoalExtractor,
+                features_extractor_kwargs={"clip": features_clip},
+                optimizer_kwargs=optimizer_kwargs,
+                **kwargs,
+            )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        """What `save` writes beside the weights, for `load` to build the policy from."""
+        arguments = super()._get_constructor_parameters()
+        for brought in ("features_extractor_class", "features_extractor_kwargs"):
+            del arguments[brought]
+        own = {"critic_layer_norm": self.critic_layer_norm, "features_clip": self.features_clip}
+        return {**arguments, **own}
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)

@@ -52,6 +52,39 @@ def checked_goals(space: spaces.Space, has: Callable[[str], bool]) -> np.dtype[A
     return goals.dtype
 
 
+def terminal_observation(info: dict[str, Any]) -> Observation:
+    """Return the observation that an episode ended with.
+
+    Raises:
+        ValueError: the vectorised environment does not tell it.
+    """
+    last = info.get("terminal_observation")
+    if not isinstance(last, dict):
+        raise ValueError(
+            "the vectorised environment's info has no 'terminal_observation' at the end of an "
+            f"episode, but {last!r}; it must hold the last observation, as a dict"
+        )
+    return last
+
+
+def check_goal_stays(given: np.ndarray, original: np.ndarray) -> None:
+    """Refuse an environment whose goal moves: an imagined goal belongs to a whole episode.
+
+    Args:
+        given: the environment's goals after a step, (..., 3) metres.
+        original: those that its episodes began with, of the same shape.
+
+    Raises:
+        ValueError: one differs.
+    """
+    if not np.array_equal(np.asarray(given).astype(original.dtype, copy=False), original):
+        raise ValueError(
+            "Imagined goals need an environment whose goal stays the same within an episode; "
+            f"this one's moved from {np.asarray(original).tolist()} to "
+            f"{np.asarray(given).tolist()}."
+        )
+
+
 def success_method(has: Callable[[str], bool]) -> str:
     """Return the name of the environment's method that judges any goal."""
     for name in SUCCESS_METHODS:

@@ -17,7 +17,7 @@ from torch import nn
 from ..common.copies import WholeCopies
 from ..common.files import atomic_write
 from ..common.numbers import checked_whole
-from ..common.torch_helpers import one_thread_after_forks, usable_device
+from ..common.torch_helpers import one_thread_after_forks, usable_device, usual_defaults
 from ..settings.learning import PredictorSettings
 from .predictor_files import (
     FACTS_FILE,
@@ -72,7 +72,8 @@ class GoalPredictor(WholeCopies):
         self.error_mm = error_mm
         self.device = torch.device("cpu")
         self._tensors = tensors
-        self._network = _network(self.hidden)
+        with usual_defaults():
+            self._network = _network(self.hidden)
         self._network.load_state_dict(
             {name: value for name, value in tensors.items() if name not in SCALES}
         )
@@ -81,6 +82,7 @@ class GoalPredictor(WholeCopies):
         self._scales = {name: tensors[name].numpy().copy() for name in SCALES}
 
     @classmethod
+    @usual_defaults()
     def fit(
         cls,
         paths: np.ndarray,
@@ -216,9 +218,11 @@ class GoalPredictor(WholeCopies):
         if (k != np.round(k)).any():
             raise ValueError(f"k must hold whole numbers, got {k[k != np.round(k)][0]} in it.")
         inputs = np.concatenate([start, goal, k[:, None]], axis=1, dtype=np.float64)
-        scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
+        with np.errstate(under="ignore"):
+            scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
+            scaled = scaled.astype(np.float32)
         with torch.inference_mode():
-            on = torch.from_numpy(scaled.astype(np.float32)).to(self.device)
+            on = torch.from_numpy(scaled).to(self.device)
             outputs = self._network(on).cpu().numpy()
         return outputs * self._scales["output_std"] + self._scales["output_mean"]
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..common.answers import check_shape
 from .curriculum import Curriculum
 from .goal_predictor import GoalPredictor
 
 
+@np.errstate(under="ignore")
 def imagine(
     predictor: GoalPredictor,
     curriculum: Curriculum,
@@ -34,10 +36,15 @@ def imagine(
     if level.size and not (level.min() >= 1 and level.max() <= curriculum.n_levels):
         raise ValueError(f"Levels must lie in 1..{curriculum.n_levels}, got {level.tolist()}.")
     if curriculum.levels == "time":
-        return predictor.predict(start, goal, level)
-    return _all_levels(predictor, curriculum, start, goal)[np.arange(len(level)), level - 1]
+        imagined = predictor.predict(start, goal, level)
+    else:
+        levels = _all_levels(predictor, curriculum, start, goal)
+        imagined = levels[np.arange(len(level)), level - 1]
+    check_shape(imagined, np.shape(start), "the goals that the predictor imagines")
+    return imagined
 
 
+@np.errstate(under="ignore")
 def draw_goals(
     predictor: GoalPredictor,
     curriculum: Curriculum,

@@ -14,10 +14,19 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from ..common.answers import check_shape, one_each
 from ..common.copies import WholeCopies
 from ..common.vec_env_copies import let_vec_envs_be_copied, reduce_vec_wrapper
 from .curriculum import Curriculum
-from .goal_env import STREAM, Observation, check_horizons, checked_goals, success_method
+from .goal_env import (
+    STREAM,
+    Observation,
+    check_goal_stays,
+    check_horizons,
+    checked_goals,
+    success_method,
+    terminal_observation,
+)
 from .goal_predictor import GoalPredictor
 from .imagined_goals import draw_goals, imagine
 from .predictor_files import POSITION
@@ -90,9 +99,13 @@ class ImaginedGoalVecEnv(WholeCopies, VecEnvWrapper):
         venv_obs, rewards, dones, infos = self.venv.step_wait()
         obs = cast(Observation, venv_obs)
         ended = np.flatnonzero(dones)
-        achieved = np.array(obs["achieved_goal"])
+        achieved, goals = np.array(obs["achieved_goal"]), np.array(obs["desired_goal"])
         for i in ended:
-            achieved[i] = infos[i]["terminal_observation"]["achieved_goal"]
+            last = terminal_observation(infos[i])
+            for array, key in ((achieved, "achieved_goal"), (goals, "desired_goal")):
+                check_shape(last[key], (POSITION,), f"the terminal observation {key!r}")
+                array[i] = last[key]
+        check_goal_stays(goals, self._original)
 
         imagined = np.flatnonzero(self._level)
         if imagined.size:
@@ -170,23 +183,21 @@ class ImaginedGoalVecEnv(WholeCopies, VecEnvWrapper):
 
     def _draw(self, rows: np.ndarray, obs: Observation) -> None:
         """Give the episodes that start in ``rows`` their goals."""
+        for key in ("achieved_goal", "desired_goal"):
+            check_shape(obs[key], self._shown.shape, f"the observation {key!r}")
         start, goal = obs["achieved_goal"][rows], obs["desired_goal"][rows]
         if self.mode == "test":
             level = np.full(len(rows), self.curriculum.k_max)
             shown = imagine(self.predictor, self.curriculum, start, goal, level)
         else:
             shown, level = draw_goals(self.predictor, self.curriculum, start, goal, self._rng)
-        self._shown[rows], self._original[rows], self._level[rows] = shown, goal, level
+        with np.errstate(under="ignore"):
+            self._shown[rows], self._original[rows], self._level[rows] = shown, goal, level
 
     def _ask(self, method: str, *args: Any) -> np.ndarray:
         """Return what the first copy's method says of each row of ``args``."""
-        answer = np.asarray(self.venv.env_method(method, *args, indices=[0])[0])
-        if answer.size != len(args[0]):
-            raise ValueError(
-                f"The environment's {method} must accept batches: for {len(args[0])} goals it "
-                f"returned the shape {answer.shape}."
-            )
-        return answer.reshape(-1)
+        answer = self.venv.env_method(method, *args, indices=[0])[0]
+        return one_each(answer, len(args[0]), f"the environment's {method}")
 
     def _relabel(self, obs: Observation) -> Observation:
         return {**obs, "desired_goal": self._shown.copy()}

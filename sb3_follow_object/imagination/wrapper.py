@@ -13,11 +13,19 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..common.answers import check_shape, one_number
 from ..common.copies import WholeCopies
 from ..common.providers import provider
 from ..envs import IDS, physics_id
 from .curriculum import Curriculum
-from .goal_env import STREAM, Observation, check_horizons, checked_goals, success_method
+from .goal_env import (
+    STREAM,
+    Observation,
+    check_goal_stays,
+    check_horizons,
+    checked_goals,
+    success_method,
+)
 from .goal_predictor import GoalPredictor
 from .imagined_goals import draw_goals, imagine
 from .predictor_files import POSITION
@@ -93,26 +101,33 @@ class ImaginedGoalWrapper(
         if seed is not None:
             self._rng = np.random.default_rng([seed, STREAM])
         obs, info = self.env.reset(seed=seed, options=options)
+        for key in ("achieved_goal", "desired_goal"):
+            check_shape(obs[key], (POSITION,), f"the observation {key!r}")
         self._original = obs["desired_goal"].copy()
         self._shown, self._level = self._original, 0
         if self.active:
             shown, level = self._draw(obs["achieved_goal"][None], obs["desired_goal"][None])
-            self._shown, self._level = shown[0].astype(self._dtype), int(level[0])
+            with np.errstate(under="ignore"):
+                self._shown, self._level = shown[0].astype(self._dtype), int(level[0])
         return self._relabel(obs), {**info, **self._facts()}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Step the environment; reward and success are those of the shown goal."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         achieved = obs["achieved_goal"]
+        check_goal_stays(obs["desired_goal"], self._original)
+        asked = "the environment's step"
         if self._level > 0:
-            reward = float(self._compute_reward(achieved, self._shown, info))
+            reward = self._compute_reward(achieved, self._shown, info)
+            asked = "the environment's compute_reward"
+        paid = one_number(reward, asked)
         info = {
             **info,
             **self._facts(),
-            "is_success": bool(self._is_success(achieved, self._shown)),
-            "original_success": bool(self._is_success(achieved, self._original)),
+            "is_success": self._succeeds(achieved, self._shown),
+            "original_success": self._succeeds(achieved, self._original),
         }
-        return self._relabel(obs), float(reward), terminated, truncated, info
+        return self._relabel(obs), paid, terminated, truncated, info
 
     def load_curriculum(self, state: dict[str, Any]) -> None:
         """Follow a curriculum that advances elsewhere (``Curriculum.state_dict``), from now on."""
@@ -125,6 +140,9 @@ class ImaginedGoalWrapper(
             level = np.array([self.curriculum.k_max])
             return imagine(self.predictor, self.curriculum, start, goal, level), level
         return draw_goals(self.predictor, self.curriculum, start, goal, self._rng)
+
+    def _succeeds(self, achieved: np.ndarray, desired: np.ndarray) -> bool:
+        return bool(one_number(self._is_success(achieved, desired), "the environment's is_success"))
 
     def _relabel(self, obs: Observation) -> Observation:
         return {**obs, "desired_goal": self._shown.copy()}

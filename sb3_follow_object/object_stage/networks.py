@@ -14,7 +14,7 @@ from torch import nn
 
 from ..common.array_trees import load_tree, save_tree
 from ..common.numbers import checked_whole
-from ..common.torch_helpers import WholeModule, lowest
+from ..common.torch_helpers import WholeModule, lowest, usual_defaults
 from ..ddpg.her_ddpg import HerDDPG
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
 from ..imagination.predictor_files import valid_hidden
@@ -66,7 +66,8 @@ class ObjectNetworks(WholeModule):
             "clip": clip,
         }
         self.inverse_error = float("nan")
-        with th.random.fork_rng(devices=[]):  # what is drawn here is replaced
+        # What is drawn here is replaced.
+        with usual_defaults(), th.random.fork_rng(devices=[]):
             policy = HerPolicy(
                 _dict_space(),
                 spaces.Box(-1.0, 1.0, (ACTION,), np.float32),
@@ -146,7 +147,8 @@ class ObjectNetworks(WholeModule):
         networks.nu.load_state_dict(model.actor.mu.state_dict())
         for copy, critic in zip(networks.critics, model.critic.q_networks, strict=True):
             copy.load_state_dict(critic.state_dict())
-        networks._fit_inverse(model, settings, seed, between_updates)
+        with usual_defaults():
+            networks._fit_inverse(model, settings, seed, between_updates)
         return networks
 
     def _fit_inverse(

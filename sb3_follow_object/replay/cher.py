@@ -54,7 +54,7 @@ class GoalSelection:
     def proximity_weights(self, n_batches: int) -> np.ndarray:
         """Weights of proximity in the next batches (n_batches,)."""
         batch = np.arange(self.n_batches, self.n_batches + n_batches, dtype=np.float64)
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", under="ignore"):
             return self.weight * np.minimum(self.growth**batch, _MAX_GROWTH)
 
     def choose(

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
+from ..common.answers import one_each
 from ..common.copies import WholeCopies
 from ..common.torch_helpers import own
 from ..envs.tasks import SUCCESS_DISTANCE
@@ -54,15 +55,15 @@ class DistanceReward:
         way *= distance / np.linalg.norm(way, axis=1, keepdims=True)
         achieved = desired + way.astype(np.float32)
         infos: list[dict[str, Any]] = [{}] * _PROBES
-        answer = np.asarray(
-            env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
+        answer = one_each(
+            env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0],
+            _PROBES,
+            "the environment's compute_reward",
         )
         clear = np.abs(distance[:, 0] - threshold) > _TIE
         for candidate in (cls(threshold), cls(None)):
             rewards = candidate(th.from_numpy(achieved), th.from_numpy(desired)).numpy()
-            if answer.shape == rewards.shape and np.allclose(
-                answer[clear], rewards[clear], rtol=0.0, atol=1e-5
-            ):
+            if np.allclose(answer[clear], rewards[clear], rtol=0.0, atol=1e-5):
                 return candidate
         raise ValueError(
             "replay on the device can compute rewards of 0 within a distance and -1 beyond, or "
@@ -84,8 +85,6 @@ def device_replay_of(buffer: Any, device: th.device, wanted: bool | None) -> Dev
     if wanted is False or (wanted is None and device.type != "cuda"):
         return None
     try:
-        if not isinstance(buffer, FollowObjectReplayBuffer):
-            raise ValueError("replay on the device needs a FollowObjectReplayBuffer")
         return DeviceReplay(buffer, device, np.random.randint(2**31))
     except ValueError as error:
         if wanted:
@@ -110,23 +109,37 @@ class DeviceReplay(WholeCopies):
     """
 
     def __init__(self, buffer: FollowObjectReplayBuffer, device: th.device, seed: int) -> None:
-        self._check(buffer)
-        assert buffer.env is not None and buffer.achieved is not None
-        self.reward = DistanceReward.of(buffer.env, buffer.observations["desired_goal"].shape[-1])
         self.device = device
+        self._env: VecEnv | None = None
+        self._take(buffer)
         self.generator = th.Generator(device).manual_seed(seed)
+        self._lists: dict[bool, tuple[Any, th.Tensor, th.Tensor]] = {}
+
+    def _take(self, buffer: FollowObjectReplayBuffer) -> None:
+        """Make room for a buffer and find out what its environment pays."""
+        self._check(buffer)
+        assert buffer.achieved is not None
+        self._follow_env(buffer)
         self._buffer = buffer
         self._seen = (-1, 0)  # the buffer's revision and time-steps at the last refresh
         self._records = self._room_for(buffer.records)
         self._achieved = self._room_for(buffer.achieved)
-        self._lists: dict[bool, tuple[Any, th.Tensor, th.Tensor]] = {}
+
+    def _follow_env(self, buffer: FollowObjectReplayBuffer) -> None:
+        if buffer.env is None:
+            raise ValueError("the replay buffer has no environment: call set_env() after loading")
+        goal_size = buffer.observations["desired_goal"].shape[-1]
+        self.reward = DistanceReward.of(buffer.env, goal_size)
+        self._env = buffer.env
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._records, self._achieved = own(self._records), own(self._achieved)
 
     @staticmethod
-    def _check(buffer: FollowObjectReplayBuffer) -> None:
+    def _check(buffer: Any) -> None:
+        if not isinstance(buffer, FollowObjectReplayBuffer):
+            raise ValueError("replay on the device needs a FollowObjectReplayBuffer")
         keys = {f"{half}.{key}" for half in HALVES for key in buffer.observations}
         stored = {*buffer.records.views(), ACHIEVED, NEXT_DESIRED}
         reasons = {
@@ -144,15 +157,20 @@ class DeviceReplay(WholeCopies):
 
     def _room_for(self, records: Records) -> th.Tensor:
         n_slots, n_envs, width = records.array.shape
-        return th.zeros((n_slots * n_envs, width), device=self.device)
+        return th.zeros((n_slots * n_envs, width), dtype=th.float32, device=self.device)
 
-    def refresh(self, buffer: FollowObjectReplayBuffer) -> None:
-        """Take over what the buffer holds; it may be another one of the same shape than before.
+    def refresh(self, buffer: Any) -> None:
+        """Take over what the buffer holds; it and its environment may be others than before.
 
         Raises:
-            ValueError: it holds an episode whose goal moved.
+            ValueError: it has a setting or an environment that needs the host, or holds an episode
+                whose goal moved.
             RuntimeError: it holds no finished episode.
         """
+        if buffer is not self._buffer:
+            self._take(buffer)
+        elif buffer.env is not self._env:
+            self._follow_env(buffer)
         buffer.check_ready()
         if not buffer.goals_are_shared:
             raise ValueError(
@@ -162,7 +180,7 @@ class DeviceReplay(WholeCopies):
         assert buffer.achieved is not None
         revision, n_steps = self._seen
         new = buffer.n_added - n_steps
-        if buffer is not self._buffer or buffer.revision != revision or new >= buffer.buffer_size:
+        if buffer.revision != revision or new >= buffer.buffer_size:
             parts = [(0, buffer.buffer_size if buffer.full else buffer.pos)]
         elif new <= buffer.pos:
             parts = [(buffer.pos - new, buffer.pos)]
@@ -176,7 +194,6 @@ class DeviceReplay(WholeCopies):
             ):
                 array = records.array[first:last].reshape(-1, copy.shape[1])
                 copy[rows].copy_(th.from_numpy(array))
-        self._buffer = buffer
         self._seen = (buffer.revision, buffer.n_added)
         for by_priority in (False, True):
             self._refresh_list(by_priority)

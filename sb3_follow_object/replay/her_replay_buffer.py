@@ -9,10 +9,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from ..common.answers import one_each
 from ..common.numbers import checked_whole
 from ..imagination.imagined_goals import imagine
 from ..imagination.vec_env import imagination_of
@@ -20,7 +20,8 @@ from ..settings.learning import ReplaySettings
 from ..settings.sizes import check_buffer
 from .cher import GoalSelection
 from .episode_table import EpisodeTable
-from .record_buffer import NEXT_DESIRED, RecordReplayBuffer, check_finite
+from .record_buffer import NEXT_DESIRED, RecordReplayBuffer
+from .steps import lost_steps
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
 Strategy = GoalSelectionStrategy | str
@@ -133,8 +134,8 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
                 f"moved_priority 'energy' reads a height in metres from goals of 3 numbers; these "
                 f"have {goal_shape[-1]}: take 'uniform'"
             )
-        if self.imagined_ratio > 0.0:
-            imagination_of(env, IMAGINED_RATIO)  # raises now rather than at the first sample
+        if env is not None:
+            self.check_env(env)  # raises now rather than at the first sample
         self.rng = np.random.default_rng(
             np.random.randint(2**31) if settings.seed is None else settings.seed
         )
@@ -161,34 +162,91 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
     ) -> None:
         """Store one step of every environment; arguments as in HerReplayBuffer.
 
-        An episode whose info says "diverged" at its end is dropped: it is never sampled.
+        A step that does not begin where the last one ended begins another episode: the environment
+        was reset meanwhile. An episode is dropped, so that it is never sampled, whose info says
+        "diverged" at its end, or whose steps were not all stored (`lost_steps`).
 
         Raises:
-            ValueError: an environment returned NaN or infinity; nothing of the step is stored.
+            ValueError: an array has another shape than the environments', or holds NaN or infinity;
+                nothing of the step is stored.
         """
         if self.n_added == 0:
             self.check_size()
-        check_finite(obs, next_obs, action, reward)
         pos = self.pos
         rows = [
             self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
-            for env_idx in np.flatnonzero(self.ep_length[pos])
+            for env_idx in self.ep_length[pos].nonzero()[0]
         ]
         for row in sorted(rows):
             self._forget_episode(row)
-        self._make_room_for(obs, next_obs)
+        # What is too small for float32 becomes 0, what is too large is refused.
+        with np.errstate(under="ignore", over="ignore"):
+            self._write(obs, next_obs, action, reward, done, infos)
+        running = self._current_ep_start != pos
+        if running.any():
+            self.end_episodes(self._broken_off(running))
         self.ep_start[pos] = self._current_ep_start
         if self.copy_info_dict:
             self.infos[pos] = infos
         if self.imagined_ratio > 0.0:
             self.original_goals[pos] = [info["original_goal"] for info in infos]
-        super(HerReplayBuffer, self).add(obs, next_obs, action, reward, done, infos)
+        self.pos = (pos + 1) % self.buffer_size
+        self.full |= self.pos == 0
         self.n_added += 1
-        for env_idx in np.flatnonzero(done):
-            if "diverged" in infos[env_idx]:
+        self._end_finished(np.asarray(done, dtype=bool).reshape(self.n_envs), infos)
+
+    def _end_finished(self, done: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """End the episodes that the step ended; drop those that are not to be sampled."""
+        for env_idx in done.nonzero()[0]:
+            n_steps = (self.pos - self._current_ep_start[env_idx]) % self.buffer_size
+            if "diverged" in infos[env_idx] or lost_steps(infos[env_idx], n_steps):
                 self._current_ep_start[env_idx] = self.pos
             else:
                 self._compute_episode_length(int(env_idx))
+        if self.full:  # one that is as long as the buffer would overwrite itself
+            for env_idx in ((self._current_ep_start == self.pos) & ~done).nonzero()[0]:
+                self._compute_episode_length(int(env_idx))
+
+    def end_episodes(self, env_indices: np.ndarray | None = None) -> None:
+        """End running episodes where they stand, as a time limit would: they are sampled then.
+
+        Args:
+            env_indices: of the environments, by default all, (n,) int.
+        """
+        if env_indices is None:
+            env_indices = np.flatnonzero(self._current_ep_start != self.pos)
+        for env_idx in env_indices:
+            self._compute_episode_length(int(env_idx))
+
+    def set_env(self, env: VecEnv) -> None:
+        """Ask another environment for rewards and imagined goals from now on.
+
+        Episodes that ran in an earlier one end where they stand. An algorithm of SB3 does not tell
+        its replay buffer of `set_env`; `HerDDPG` and `CurriculumCallback` do.
+
+        Raises:
+            ValueError: it has another number of copies, or lacks what the buffer asks for.
+        """
+        self.check_env(env)
+        if self.env is not None and env is not self.env:
+            self.end_episodes()
+        self.env = env
+
+    def check_env(self, env: VecEnv) -> None:
+        """Raise a ValueError for an environment that `set_env` refuses."""
+        if env.num_envs != self.n_envs:
+            raise ValueError(
+                f"the replay buffer holds steps of {self.n_envs} environments; this one has "
+                f"{env.num_envs} copies"
+            )
+        if self.imagined_ratio > 0.0:
+            imagination_of(env, IMAGINED_RATIO)
+        asks = self.reward_function is None and self.her_ratio > 0.0
+        if asks and not env.has_attr("compute_reward"):
+            raise ValueError(
+                "hindsight needs an environment with compute_reward(achieved, desired, infos), "
+                "this one has none; or give a reward_function"
+            )
 
     def _forget_episode(self, row: int) -> None:
         """Make an episode that is about to be overwritten invisible to sampling."""
@@ -285,12 +343,17 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         if spec is not None and spec.max_episode_steps is not None:
             check_buffer(self.buffer_size, self.n_envs, spec.max_episode_steps)
 
+    def is_ready(self) -> bool:
+        """Whether an episode has ended, so that there is something to draw from."""
+        return self.table.n_transitions() > 0
+
     def check_ready(self) -> None:
         """Raise RuntimeError while there is nothing to draw from."""
-        if self.table.n_transitions() == 0:
+        if not self.is_ready():
             raise RuntimeError(
-                "the replay buffer holds no finished episode yet; "
-                "set learning_starts to at least one episode of every environment"
+                "the replay buffer holds no finished episode yet: set learning_starts to at least "
+                "one episode of every environment; or, where a loaded model goes on with "
+                "reset_num_timesteps=False, load its replay buffer too"
             )
 
     def moved_share(self) -> float:
@@ -315,6 +378,7 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
 
         Raises:
             RuntimeError: before the end of the first episode.
+            ValueError: rewards or imagined goals of another shape, or not finite.
         """
         return self.sample_with_steps(batch_size, env)[0]
 
@@ -333,6 +397,14 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
             transition until it stood on the hindsight goal; infinite where the goal shown is kept.
         """
         self.check_ready()
+        with np.errstate(under="ignore"):
+            return self._sample_with_steps(batch_size, env, n_batches)
+
+    def _sample_with_steps(
+        self, batch_size: int, env: VecNormalize | None, n_batches: int
+    ) -> tuple[DictReplayBufferSamples, th.Tensor]:
+        if env is not None and self.env is not None and unwrap_vec_normalize(self.env) is not env:
+            self.set_env(env)  # of an algorithm that was given another environment
         if self.selection is not None:
             batch_size *= self.selection.candidates
         row, step = self._draw(batch_size)
@@ -440,7 +512,19 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         # Where no infos are kept, one empty dict does for all.
         infos = list(self._take(self.infos, flat)) if self.copy_info_dict else [{}] * len(flat)
         if self.reward_function is not None:
-            return self.reward_function(achieved, desired, infos)
-        if self.env is None:
+            answer, asked = self.reward_function(achieved, desired, infos), "reward_function"
+        elif self.env is None:
             raise RuntimeError("the replay buffer has no environment: call set_env() after loading")
-        return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
+        else:
+            answer, asked = self._ask(achieved, desired, infos), "the environment's compute_reward"
+        return one_each(answer, len(flat), asked)
+
+    def _ask(self, achieved: np.ndarray, desired: np.ndarray, infos: list[dict[str, Any]]) -> Any:
+        assert self.env is not None
+        try:
+            return self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
+        except (OSError, EOFError) as error:
+            raise ValueError(
+                f"the replay buffer's environment does not answer ({error}); after "
+                "model.set_env(env), call model.replay_buffer.set_env(model.env)"
+            ) from error

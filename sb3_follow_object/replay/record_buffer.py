@@ -11,10 +11,14 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from ..common.copies import WholeCopies
 from .records import Records
+from .steps import fitted, refuse_infinite, same_bytes
 
 HALVES = ("observations", "next_observations")
 DESIRED, NEXT_DESIRED = "observations.desired_goal", "next_observations.desired_goal"
 ACHIEVED = "next_observations.achieved_goal"
+# What sentences call them.
+_SAID = {"observations": "the observation", "next_observations": "the next observation"}
+_SAID |= {"actions": "the action", "rewards": "the reward", "dones": "the end of the episode"}
 
 
 @dataclass
@@ -104,19 +108,84 @@ class RecordReplayBuffer(WholeCopies, HerReplayBuffer):
                 getattr(self, half)[key] = view
             else:
                 setattr(self, name, view)
+        self._find_checked()
+
+    def _find_checked(self) -> None:
+        """Note the arrays that a step's numbers are in, where they can be NaN or infinite."""
+        stores = RecordReplayBuffer._stores(self).values()
+        self._checked = [store for store in stores if store.dtype.kind == "f"]
 
     def _share_goals(self, shared: bool) -> None:
         """Store desired goals of observations and next observations once, or twice."""
         self.goals_are_shared = shared
         goals = self.observations["desired_goal"]
         self.next_observations["desired_goal"] = goals if shared else goals.copy()
+        self._find_checked()
 
-    def _make_room_for(self, obs: dict[str, np.ndarray], next_obs: dict[str, np.ndarray]) -> None:
-        """Store desired goals twice from now on if those of a step differ."""
-        if self.goals_are_shared and not np.array_equal(
-            obs["desired_goal"], next_obs["desired_goal"]
-        ):
-            self._share_goals(False)
+    def _write(
+        self,
+        obs: dict[str, np.ndarray],
+        next_obs: dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Write a step of every environment into the slot at `pos`, which stays where it is.
+
+        Raises:
+            ValueError: an array does not fit, or holds NaN or infinity.
+        """
+        pos = self.pos
+        if self.goals_are_shared:
+            goals, later = obs["desired_goal"], next_obs["desired_goal"]
+            if later is not goals and not same_bytes(later, goals) and (later != goals).any():
+                self._share_goals(False)  # stored twice from now on
+        for half, given in zip(HALVES, (obs, next_obs), strict=True):
+            for key, store in getattr(self, half).items():
+                slot, array = store[pos], given[key]
+                if np.shape(array) != slot.shape:
+                    array = fitted(array, slot.shape, f"{_SAID[half]} {key!r}")
+                slot[...] = array
+        for name, array in (("actions", action), ("rewards", reward), ("dones", done)):
+            slot = getattr(self, name)[pos]
+            if np.shape(array) != slot.shape:
+                array = fitted(array, slot.shape, _SAID[name])
+            slot[...] = array
+        if len(infos) != self.n_envs:
+            raise ValueError(f"there are {len(infos)} infos for {self.n_envs} environments")
+        for env_idx in self.dones[pos].nonzero()[0]:
+            for key, value in (infos[env_idx].get("terminal_observation") or {}).items():
+                if key in self.observations:
+                    shape = self.observations[key].shape[2:]
+                    fitted(value, shape, f"the terminal observation {key!r}")
+        if self.handle_timeout_termination:
+            self.timeouts[pos] = [info.get("TimeLimit.truncated", False) for info in infos]
+        if not all(np.isfinite(store[pos]).all() for store in self._checked):
+            refuse_infinite(self._slot(pos))
+
+    def _slot(self, pos: int) -> dict[str, np.ndarray]:
+        """What a slot holds, by what a sentence calls it."""
+        named = {
+            f"{_SAID[half]} {key!r}": store[pos]
+            for half in HALVES
+            for key, store in getattr(self, half).items()
+        }
+        return named | {_SAID[name]: getattr(self, name)[pos] for name in ("actions", "rewards")}
+
+    def _broken_off(self, running: np.ndarray) -> np.ndarray:
+        """Environments (m,) whose step at `pos` does not begin where their last one ended.
+
+        Args:
+            running: whose episode waits for more steps, (n_envs,) bool; no other is broken off.
+        """
+        pos, broken = self.pos, np.zeros(0, dtype=bool)
+        for key, store in self.observations.items():
+            here, before = store[pos], self.next_observations[key][pos - 1]
+            if not same_bytes(here, before):
+                differs = (here != before).reshape(self.n_envs, -1).any(axis=1) & running
+                broken = broken | differs if len(broken) else differs
+        return broken.nonzero()[0]
 
     def bytes_per_transition(self) -> float:
         """Bytes of arrays that a stored transition takes."""
@@ -144,6 +213,7 @@ class RecordReplayBuffer(WholeCopies, HerReplayBuffer):
                 key: None if f"{half}.{key}" in views else array
                 for key, array in state[half].items()
             }
+        del state["_checked"]
         return {name: value for name, value in state.items() if name not in views}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -197,23 +267,3 @@ class RecordReplayBuffer(WholeCopies, HerReplayBuffer):
     def _take(self, store: np.ndarray, flat: np.ndarray) -> np.ndarray:
         """Copy of the (slot, environment) entries with the given flat indices."""
         return store.reshape(self.buffer_size * self.n_envs, *store.shape[2:]).take(flat, axis=0)
-
-
-def check_finite(
-    obs: dict[str, np.ndarray],
-    next_obs: dict[str, np.ndarray],
-    action: np.ndarray,
-    reward: np.ndarray,
-) -> None:
-    """Refuse a step of every environment that holds NaN or infinity.
-
-    Raises:
-        ValueError: with what holds it and of which environment.
-    """
-    named = {f"the observation {key!r}": value for key, value in obs.items()}
-    named |= {f"the next observation {key!r}": value for key, value in next_obs.items()}
-    for name, array in {**named, "the action": action, "the reward": reward}.items():
-        finite = np.isfinite(array)
-        if not finite.all():
-            index = np.argwhere(~finite)[0, 0]
-            raise ValueError(f"{name} of environment {index} holds NaN or infinity")

@@ -21,6 +21,7 @@ from ..callbacks.rollout import Episodes, run_episodes
 from ..common.files import atomic_write, lock, remove_half_written
 from ..common.reports import Report, Trouble, reason
 from ..common.seeds import stream_seed
+from ..common.torch_helpers import threads_at
 from ..ddpg.actor_files import load_actor
 from ..envs import make_vec
 from ..follow_object.follow_object import FollowObject
@@ -99,7 +100,7 @@ def train(
             check_sizes(config)
             if sentence := idle_robot(config):
                 report(Trouble(sentence))
-        th.set_num_threads(1)  # nothing but the robot's gradient steps gains from more
+        stack.enter_context(threads_at(1))  # only the robot's gradient steps gain from more
         stop = stack.enter_context(StopSignals())
         run = FollowObject(
             config.env_id,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +24,8 @@ Progress = Callable[[dict[str, Any]], None]
 class StopSignals(NoCopies):
     """Notes SIGINT and SIGTERM, so that a training can end where nothing is lost.
 
-    A second signal raises KeyboardInterrupt at once.
+    A second signal raises KeyboardInterrupt at once. Off the main thread, where Python delivers no
+    signals, nothing is noted and nothing is changed.
     """
 
     no_copies = "StopSignals hold this process's signal handlers and cannot be copied: make others"
@@ -38,13 +40,16 @@ class StopSignals(NoCopies):
             raise KeyboardInterrupt
 
     def __enter__(self) -> StopSignals:
+        if threading.current_thread() is not threading.main_thread():
+            return self
         for sig in (signal.SIGINT, signal.SIGTERM):
             self._earlier[sig] = signal.signal(sig, self._note)
         return self
 
     def __exit__(self, *raised: object) -> None:
         for sig, handler in self._earlier.items():
-            signal.signal(sig, handler)
+            # None stands for one that was not installed from Python, which has no other name.
+            signal.signal(sig, signal.SIG_DFL if handler is None else handler)
 
     def _note(self, signum: int, frame: Any) -> None:
         self.check()

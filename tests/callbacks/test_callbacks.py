@@ -16,6 +16,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
 from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
+from sb3_follow_object.callbacks.rollout import run_episodes
+from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.imagination.curriculum import Curriculum
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
@@ -386,3 +388,59 @@ def test_bad_evaluation_settings_are_refused(options: dict[str, int]) -> None:
 def test_an_evaluation_in_vec_normalize_is_refused() -> None:
     with pytest.raises(ValueError, match="eval_env is in VecNormalize"):
         OriginalGoalEvalCallback(VecNormalize(bare()), 1, 1)
+
+
+# What comes from outside, and what runs beyond the last step
+
+
+@pytest.mark.parametrize(
+    ("policy", "info", "sentence"),
+    [
+        (lambda obs: np.zeros(3), {}, r"the policy's actions must have the shape \(4, 3\)"),
+        (lambda obs: np.zeros((1, 3)), {}, r"\(4, 3\), not \(1, 3\)"),
+        (None, {"is_success": np.nan}, "is_success in the info must give one finite number"),
+        (None, {"is_success": np.zeros(2)}, r"one finite number, not the shape \(2,\)"),
+        (None, {"is_success": None}, "is_success in the info"),
+    ],
+)
+def test_episodes_take_nothing_that_does_not_fit(
+    policy: Any, info: dict[str, Any], sentence: str
+) -> None:
+    class Odd(toy.PointEnv):
+        def step(self, action: np.ndarray) -> Any:
+            *rest, own = super().step(action)
+            return *rest, {**own, **info}
+
+    zeros = np.zeros((N, 3), np.float32)
+    with pytest.raises(ValueError, match=sentence):
+        run_episodes(policy or (lambda obs: zeros), DummyVecEnv([Odd] * N), N)
+
+
+def test_rewards_of_a_vectorised_environment_are_not_broadcast() -> None:
+    class Scalar(DummyVecEnv):
+        def step_wait(self) -> Any:
+            obs, rewards, dones, infos = super().step_wait()
+            return obs, rewards[0], dones, infos
+
+    with pytest.raises(ValueError, match="the environment's step must accept batches"):
+        run_episodes(lambda obs: np.zeros((N, 3)), Scalar([toy.PointEnv] * N), N)
+
+
+@pytest.mark.parametrize("algorithm", [HerDDPG, DDPG, SAC])
+def test_schedules_end_at_zero_with_tests_beyond_the_last_step(algorithm: Any) -> None:
+    rates: list[float] = []
+
+    def linear(progress: float) -> float:
+        rates.append(1e-3 * progress)
+        return rates[-1]
+
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    model = learner(
+        imagining(curriculum), algorithm, learning_rate=linear, learning_starts=0, batch_size=8
+    )
+    rollout = N * toy.HORIZON
+    model.learn(3 * rollout + 1, callback=CurriculumCallback(imagining(curriculum, "test"), N))
+    assert model.num_timesteps == 4 * rollout
+    assert min(rates) >= 0.0 and rates[-1] <= 1e-3 / 3
+    model.learn(rollout // 2, callback=CurriculumCallback(imagining(curriculum, "test"), N))
+    assert min(rates) == 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any, cast
 
@@ -413,3 +414,109 @@ def test_rewards_that_take_no_batches_are_refused() -> None:
     venv.reset()
     with pytest.raises(ValueError, match="compute_reward must accept batches"):
         venv.step(np.zeros((N, 3), np.float32))
+
+
+# What comes from outside
+
+
+class Answers(toy.PointEnv):
+    """Somebody's methods, which give one goal's answer in an array of one."""
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        return np.asarray(toy.PointEnv.is_success(self, achieved, desired))[..., None] - 1.0
+
+    def is_success(self, achieved: Any, desired: Any) -> Any:
+        return np.asarray(super().is_success(achieved, desired))[..., None]
+
+    def step(self, action: np.ndarray) -> Any:
+        self.position = self.position + toy.STEP * np.clip(action, -1, 1)
+        self.steps += 1
+        paid = float(toy.PointEnv.is_success(self, self.position, self.goal)) - 1.0
+        return self._observe(), paid, False, self.steps >= toy.HORIZON, {}
+
+
+def many(env: type[gym.Env], **options: Any) -> VecEnv:
+    return vec_env(toy.curriculum(p=0.0, **options), env=env)
+
+
+def one(env: type[gym.Env], **options: Any) -> VecEnv:
+    curriculum = toy.curriculum(p=0.0, **options)
+    wrapped = ImaginedGoalWrapper(env(), toy.StraightPredictor(), curriculum)
+    return DummyVecEnv([lambda: wrapped])
+
+
+@pytest.mark.parametrize("make", [many, one])
+def test_answers_in_arrays_of_one_are_numbers(make: Callable[..., VecEnv]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        finished = episodes(make(Answers, k_max=5), 20)
+    check_transitions(toy.curriculum(k_max=5), finished)
+
+
+def returning(method: str, answer: Any) -> type[gym.Env]:
+    class Odd(Answers):
+        pass
+
+    setattr(Odd, method, lambda self, *asked: answer)
+    return Odd
+
+
+@pytest.mark.parametrize("make", [many, one])
+@pytest.mark.parametrize("method", ["compute_reward", "is_success"])
+@pytest.mark.parametrize(
+    "answer", [None, np.zeros(7), np.zeros((4, 2)), "yes", [1.0, [2.0]], np.nan, [np.nan] * 4]
+)
+def test_other_answers_are_a_sentence(
+    answer: Any, method: str, make: Callable[..., VecEnv]
+) -> None:
+    with pytest.raises(ValueError, match=f"the environment's {method} (must|returned)"):
+        episodes(make(returning(method, answer)), 2)
+
+
+@pytest.mark.parametrize("make", [many, one])
+@pytest.mark.parametrize("when", [3, toy.HORIZON])
+def test_goals_that_move_within_an_episode_are_refused(
+    when: int, make: Callable[..., VecEnv]
+) -> None:
+    class Moving(toy.PointEnv):
+        def step(self, action: np.ndarray) -> Any:
+            if self.steps == when - 1:
+                self.goal = self.goal + 0.01
+            return super().step(action)
+
+    venv = make(Moving)
+    assert sum(1 for _ in play(venv, when - 1)) == (when - 1) * venv.num_envs
+    with pytest.raises(ValueError, match=r"goal stays the same within an episode; .* moved"):
+        episodes(venv, when)
+
+
+def test_observations_and_imagined_goals_of_another_shape_are_refused() -> None:
+    class Flat(toy.PointEnv):
+        def _observe(self) -> dict[str, np.ndarray]:
+            return {**super()._observe(), "desired_goal": np.zeros((1, 3))}
+
+    wrapped = ImaginedGoalWrapper(Flat(), toy.StraightPredictor(), toy.curriculum())
+    with pytest.raises(ValueError, match=r"'desired_goal' must have the shape \(3,\), not \(1, 3"):
+        wrapped.reset()
+
+    class One(toy.StraightPredictor):
+        def predict(self, *asked: Any) -> np.ndarray:
+            return super().predict(*asked)[:1]
+
+    venv = ImaginedGoalVecEnv(DummyVecEnv([toy.PointEnv] * N), One(), toy.curriculum(p=0.0))
+    with pytest.raises(ValueError, match=r"the predictor imagines must have the shape \(4, 3\)"):
+        venv.reset()
+
+
+def test_a_vectorised_environment_must_tell_how_episodes_end() -> None:
+    class Forgets(DummyVecEnv):
+        def step_wait(self) -> Any:
+            obs, rewards, dones, infos = super().step_wait()
+            for info in infos:
+                info.pop("terminal_observation", None)
+            return obs, rewards, dones, infos
+
+    inner = Forgets([toy.PointEnv] * 2)
+    venv = ImaginedGoalVecEnv(inner, toy.StraightPredictor(), toy.curriculum())
+    with pytest.raises(ValueError, match="no 'terminal_observation' at the end of an episode"):
+        episodes(venv, toy.HORIZON)
