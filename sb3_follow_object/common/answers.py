@@ -18,16 +18,17 @@ def one_each(answer: Any, n: int, what: str) -> np.ndarray:
     Raises:
         ValueError: it is another shape, not numbers, or not finite.
     """
-    array = _array(answer)
-    fits = array.shape in ((n,), (n, 1)) or array.size == n == 1
-    if not fits or array.dtype.kind not in "biuf":
+    array = answer if isinstance(answer, np.ndarray) else _array(answer)
+    kind, shape = array.dtype.kind, array.shape
+    fits = shape == (n,) or shape == (n, 1) or array.size == n == 1
+    if not fits or kind not in "biuf":
         raise ValueError(
             f"{what} must accept batches: for {n} rows it must return {n} numbers, {(n,)}, "
             f"not {_told(array)}"
         )
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
+    if kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"{what} returned NaN or infinity")
-    return array.reshape(n)
+    return array if shape == (n,) else array.reshape(n)
 
 
 def one_number(answer: Any, what: str) -> float:

@@ -1,0 +1,157 @@
+"""Which episodes a replay buffer holds: when one begins, ends, counts and is overwritten."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..settings.sizes import check_buffer
+from .episode_table import EpisodeTable
+from .record_buffer import RecordReplayBuffer
+from .steps import lost_steps
+
+GRAVITY = 9.81  # m/s^2
+
+
+class EpisodeReplayBuffer(RecordReplayBuffer):
+    """RecordReplayBuffer that knows its finished episodes; `FollowObjectReplayBuffer` says more."""
+
+    imagined_ratio: float
+    moved_distance: float
+    moved_priority: str
+    step_seconds: float
+    min_goal_distance: float
+    original_goals: np.ndarray
+    _far: np.ndarray
+    table: EpisodeTable
+    n_added: int
+
+    def add(  # type: ignore[override]
+        self,
+        obs: dict[str, np.ndarray],
+        next_obs: dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one step of every environment; arguments as in HerReplayBuffer.
+
+        A step that does not begin where the last one ended begins another episode: the environment
+        was reset meanwhile. An episode is dropped, so that it is never sampled, whose info says
+        "diverged" at its end, or whose steps were not all stored (`lost_steps`).
+
+        Raises:
+            ValueError: an array has another shape than the environments', or holds NaN or infinity;
+                nothing of the step is stored.
+        """
+        if self.n_added == 0:
+            self.check_size()
+        pos = self.pos
+        rows = [
+            self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
+            for env_idx in self.ep_length[pos].nonzero()[0]
+        ]
+        for row in sorted(rows):
+            self._forget_episode(row)
+        # What is too small for float32 becomes 0, what is too large is refused.
+        with np.errstate(under="ignore", over="ignore"):
+            self._write(obs, next_obs, action, reward, done, infos)
+        running = self._current_ep_start != pos
+        if running.any():
+            self.end_episodes(self._broken_off(running))
+        self.ep_start[pos] = self._current_ep_start
+        if self.copy_info_dict:
+            self.infos[pos] = infos
+        if self.imagined_ratio > 0.0:
+            self.original_goals[pos] = [info["original_goal"] for info in infos]
+        self.pos = (pos + 1) % self.buffer_size
+        self.full |= self.pos == 0
+        self.n_added += 1
+        self._end_finished(np.asarray(done, dtype=bool).reshape(self.n_envs), infos)
+
+    def _end_finished(self, done: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """End the episodes that the step ended; drop those that are not to be sampled."""
+        for env_idx in done.nonzero()[0]:
+            n_steps = (self.pos - self._current_ep_start[env_idx]) % self.buffer_size
+            if "diverged" in infos[env_idx] or lost_steps(infos[env_idx], n_steps):
+                self._current_ep_start[env_idx] = self.pos
+            else:
+                self._compute_episode_length(int(env_idx))
+        if self.full:  # one that is as long as the buffer would overwrite itself
+            for env_idx in ((self._current_ep_start == self.pos) & ~done).nonzero()[0]:
+                self._compute_episode_length(int(env_idx))
+
+    def end_episodes(self, env_indices: np.ndarray | None = None) -> None:
+        """End running episodes where they stand, as a time limit would: they are sampled then.
+
+        Args:
+            env_indices: of the environments, by default all, (n,) int.
+        """
+        if env_indices is None:
+            env_indices = np.flatnonzero(self._current_ep_start != self.pos)
+        for env_idx in env_indices:
+            self._compute_episode_length(int(env_idx))
+
+    def _forget_episode(self, row: int) -> None:
+        """Make an episode that is about to be overwritten invisible to sampling."""
+        env_idx = self.table.env[row]
+        slots = (self.table.start[row] + np.arange(self.table.length[row])) % self.buffer_size
+        self.ep_length[slots, env_idx] = 0
+        self.table.remove(row)
+
+    def _compute_episode_length(self, env_idx: int) -> None:
+        start = int(self._current_ep_start[env_idx])
+        super()._compute_episode_length(env_idx)
+        # An episode as long as the whole buffer starts and ends on the same slot.
+        length = (self.pos - start) % self.buffer_size or self.buffer_size
+        slots = (start + np.arange(length)) % self.buffer_size
+        self.ep_length[slots, env_idx] = length
+        origin = self.observations["achieved_goal"][start, env_idx]
+        path = self.next_observations["achieved_goal"][slots, env_idx]
+        if self.min_goal_distance > 0.0:
+            distance = np.linalg.norm(path - origin, axis=1)
+            self._far[slots, env_idx] = distance >= self.min_goal_distance
+        self.table.insert(start, env_idx, length, self._priority(origin, path))
+
+    def _priority(self, origin: np.ndarray, path: np.ndarray) -> float:
+        """Priority of an episode from where the achieved goal began (d,) and went (length, d)."""
+        if np.linalg.norm(path - origin, axis=-1).max() <= self.moved_distance:
+            return 0.0
+        if self.moved_priority == "uniform":
+            return 1.0
+        moves = np.diff(path, axis=0, prepend=origin[None])
+        speed = np.linalg.norm(moves, axis=-1) / self.step_seconds
+        energy = GRAVITY * path[:, 2] + 0.5 * speed**2  # a unit mass's
+        gains = np.diff(energy, prepend=GRAVITY * origin[2])
+        return float(np.clip(gains, 0.0, None).sum())
+
+    def check_size(self) -> None:
+        """Raise a ValueError where the buffer cannot hold an episode of every environment.
+
+        Not done as it is made: what is loaded only to act may have next to none.
+        """
+        if self.env is None or not self.env.has_attr("spec"):
+            return
+        spec = self.env.get_attr("spec", indices=[0])[0]
+        if spec is not None and spec.max_episode_steps is not None:
+            check_buffer(self.buffer_size, self.n_envs, spec.max_episode_steps)
+
+    def is_ready(self) -> bool:
+        """Whether an episode has ended, so that there is something to draw from."""
+        return self.table.n_transitions() > 0
+
+    def check_ready(self) -> None:
+        """Raise RuntimeError while there is nothing to draw from."""
+        if not self.is_ready():
+            raise RuntimeError(
+                "the replay buffer holds no finished episode yet: set learning_starts to at least "
+                "one episode of every environment; or, where a loaded model goes on with "
+                "reset_num_timesteps=False, load its replay buffer too"
+            )
+
+    def moved_share(self) -> float:
+        """Share of the stored transitions that belong to episodes in which the object moved."""
+        total = self.table.n_transitions()
+        return self.table.n_transitions(with_priority=True) / total if total else 0.0
