@@ -13,8 +13,6 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from stable_baselines3.common.buffers import DictReplayBuffer
-
 from .common.extras import need
 from .ddpg.her_ddpg import HerDDPG
 from .settings.fields import check_names
@@ -37,7 +35,7 @@ _NET_ARCHS = {"small": [256, 256], "medium": [256, 256, 256], "big": [512, 512, 
 
 
 class ZooHerDDPG(HerDDPG):
-    """HerDDPG as rl_zoo3 uses it: settings of trials in one level, acting without an environment.
+    """HerDDPG as rl_zoo3 uses it: settings of trials in one level.
 
     Args:
         policy: as in HerDDPG.
@@ -78,12 +76,7 @@ class ZooHerDDPG(HerDDPG):
         """Load a model; arguments as in SB3. Without an environment it can act, not learn."""
         for name in _PARTS["policy_kwargs"]:  # a loaded policy keeps its networks
             kwargs.pop(name, None)
-        kwargs = _nested(kwargs)
-        if env is None:
-            # A hindsight buffer needs an environment to reward what it relabels.
-            kwargs |= {"buffer_size": 1, "replay_buffer_kwargs": {}}
-            kwargs["replay_buffer_class"] = DictReplayBuffer
-        return super().load(path, env, *args, **kwargs)
+        return super().load(path, env, *args, **_nested(kwargs))
 
 
 def _nested(settings: dict[str, Any]) -> dict[str, Any]:

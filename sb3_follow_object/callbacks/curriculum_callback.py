@@ -23,6 +23,8 @@ from .copyable import CopyableCallback
 from .env_copies import copies_for_tests
 from .rollout import Observation, OnStep, noise_free, run_episodes
 
+_ASKER = "CurriculumCallback"
+
 
 class CurriculumCallback(CopyableCallback):
     """Test the policy on h_max without noise and advance k_max (paper, Algorithm 1).
@@ -89,7 +91,7 @@ class CurriculumCallback(CopyableCallback):
     @property
     def curriculum(self) -> Curriculum:
         """The curriculum that the tests advance."""
-        return imagination_of(self.test_env, "CurriculumCallback")[1]
+        return imagination_of(self.test_env, _ASKER)[1]
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed training needs (JSON types); the curriculum has its own state."""
@@ -121,24 +123,25 @@ class CurriculumCallback(CopyableCallback):
 
     def _follow_training_env(self) -> None:
         """Let the tests and the replay buffer have what training has, whatever was replaced."""
-        is_copy = self._copied is not None
-        if self._test_env is None or (is_copy and self._copied is not self.training_env):
+        if self._test_env is None or self._is_outdated_copy():
             if self._test_env is not None:
                 self._test_env.close()
             self._test_env, self._copied = copies_for_tests(self.training_env), self.training_env
             # NumPy's global stream is the one that SB3 seeds.
             self._test_env.seed(int(np.random.randint(2**31 - 1000)))
-        elif is_copy and is_vecenv_wrapped(self._test_env, ImaginedGoalVecEnv):
-            imagined = unwrap_vec_wrapper(self._test_env, ImaginedGoalVecEnv)
-            assert imagined is not None
-            imagination = imagination_of(self.training_env, "CurriculumCallback")
-            imagined.predictor, imagined.curriculum = imagination
-        else:
+        elif self._copied is None:
             _check_curriculum(self.training_env, self.curriculum)
         buffer = getattr(self.model, "replay_buffer", None)
         if buffer is not None:
             check_size(buffer, self.training_env)
             follow_env(buffer, self.training_env)
+
+    def _is_outdated_copy(self) -> bool:
+        """Whether tests run in a copy of what training no longer has."""
+        if self._copied is None or self._test_env is None:
+            return False
+        ours, theirs = (imagination_of(env, _ASKER) for env in (self._test_env, self.training_env))
+        return self._copied is not self.training_env or ours != theirs
 
     def _begin_new_episodes(self) -> None:
         """Reset the environment after an exception: who knows what step it stands at."""
@@ -230,7 +233,7 @@ class CurriculumCallback(CopyableCallback):
 
 def _check_curriculum(training_env: VecEnv, curriculum: Curriculum) -> None:
     """Raise a ValueError unless the training imagines goals by the curriculum of the tests."""
-    theirs = imagination_of(training_env, "CurriculumCallback")[1]
+    theirs = imagination_of(training_env, _ASKER)[1]
     # Wrappers of single environments have copies of it, which are told of every change.
     if is_vecenv_wrapped(training_env, ImaginedGoalVecEnv) and theirs is not curriculum:
         raise ValueError("test_env must have the Curriculum object that the training has.")

@@ -205,7 +205,7 @@ def test_a_callback_says_that_no_goals_are_imagined() -> None:
     ("options", "sentence"),
     [
         ({"curriculum": {"kmax": 3}}, "kmax"),
-        ({"curriculum": {"p": 2.0}}, r"p must lie in \[0, 1\]"),
+        ({"curriculum": {"p": 2.0}}, r"p is 2.0; it must lie in \[0, 1\]"),
         ({"curriculum": {"k_max": HORIZON + 1}}, f"in 1..{HORIZON}"),
     ],
 )
