@@ -20,12 +20,13 @@ from ..settings.learning import ReplaySettings
 from ..settings.sizes import check_buffer
 from .cher import GoalSelection
 from .episode_table import EpisodeTable
-from .record_buffer import NEXT_DESIRED, RecordReplayBuffer
+from .record_buffer import NEXT_DESIRED, Gathered, RecordReplayBuffer
 from .steps import lost_steps
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
 Strategy = GoalSelectionStrategy | str
 GRAVITY = 9.81  # m/s^2
+EXECUTED = "executed_action"  # in an info: what was done in place of the action given
 IMAGINED_RATIO = "imagined_ratio > 0"  # what needs an environment that imagines goals
 
 
@@ -162,9 +163,10 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
     ) -> None:
         """Store one step of every environment; arguments as in HerReplayBuffer.
 
-        A step that does not begin where the last one ended begins another episode: the environment
-        was reset meanwhile. An episode is dropped, so that it is never sampled, whose info says
-        "diverged" at its end, or whose steps were not all stored (`lost_steps`).
+        What an info says was executed is stored in place of the action. A step that does not begin
+        where the last one ended begins another episode: the environment was reset meanwhile. An
+        episode is dropped, so that it is never sampled, whose info says "diverged" at its end, or
+        whose steps were not all stored (`lost_steps`).
 
         Raises:
             ValueError: an array has another shape than the environments', or holds NaN or infinity;
@@ -172,6 +174,8 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         """
         if self.n_added == 0:
             self.check_size()
+        if EXECUTED in infos[0]:
+            action = self._scaled(np.stack([info[EXECUTED] for info in infos]))
         pos = self.pos
         rows = [
             self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
@@ -194,6 +198,12 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
         self.full |= self.pos == 0
         self.n_added += 1
         self._end_finished(np.asarray(done, dtype=bool).reshape(self.n_envs), infos)
+
+    def _scaled(self, actions: np.ndarray) -> np.ndarray:
+        """Scale an environment's actions (n_envs, action_dim) to [-1, 1], as they are stored."""
+        assert isinstance(self.action_space, spaces.Box)
+        low, high = self.action_space.low, self.action_space.high
+        return 2.0 * (actions - low) / (high - low) - 1.0
 
     def _end_finished(self, done: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """End the episodes that the step ended; drop those that are not to be sampled."""
@@ -456,6 +466,28 @@ class FollowObjectReplayBuffer(RecordReplayBuffer):
             rewards=self._to_tensor(rewards).reshape(-1, 1),
         )
         return samples, self._to_tensor(steps_to_goal).reshape(-1, 1)
+
+    def sample_pairs(
+        self, n: int, rng: np.random.Generator
+    ) -> tuple[Gathered, Gathered, np.ndarray]:
+        """Draw stored transitions, each with a later one of its episode or itself.
+
+        Args:
+            n: how many.
+            rng: drawn from in place of the buffer's own generator.
+
+        Returns:
+            the transitions, the later ones, and how many steps later these are, (n,) int.
+        """
+        row, step = self.table.draw(n, rng)
+        episode = self.table.facts.take(row, axis=0)
+        later = rng.integers(episode[:, 2] - step)
+        first, then = (self._flat(episode, at) for at in (step, step + later))
+        return (
+            self._gather(first, self._achieved_goals(first)),
+            self._gather(then, self._achieved_goals(then)),
+            later,
+        )
 
     def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         row, step = self.table.draw(n, self.rng)
