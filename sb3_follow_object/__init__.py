@@ -16,6 +16,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .callbacks.curriculum_callback import CurriculumCallback as CurriculumCallback
     from .callbacks.eval_callback import OriginalGoalEvalCallback as OriginalGoalEvalCallback
+    from .callbacks.reach_callback import ReachCallback as ReachCallback
     from .ddpg.actor_files import load_actor as load_actor
     from .ddpg.actor_files import save_actor as save_actor
     from .ddpg.auxiliary import AuxiliaryReward as AuxiliaryReward
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from .imagination.vec_env import ImaginedGoalVecEnv as ImaginedGoalVecEnv
     from .imagination.wrapper import ImaginedGoalWrapper as ImaginedGoalWrapper
     from .object_stage.networks import ObjectNetworks as ObjectNetworks
+    from .reach.vec_env import ReachFirstVecEnv as ReachFirstVecEnv
+    from .reach.wrapper import ReachFirstWrapper as ReachFirstWrapper
     from .replay.her_replay_buffer import FollowObjectReplayBuffer as FollowObjectReplayBuffer
     from .runs.experiment import evaluate as evaluate
     from .runs.experiment import train as train
@@ -50,6 +53,9 @@ _HOME = {
     "ImaginedGoalWrapper": "imagination.wrapper",
     "ObjectNetworks": "object_stage.networks",
     "OriginalGoalEvalCallback": "callbacks.eval_callback",
+    "ReachCallback": "callbacks.reach_callback",
+    "ReachFirstVecEnv": "reach.vec_env",
+    "ReachFirstWrapper": "reach.wrapper",
     "RunConfig": "settings.run_config",
     "evaluate": "runs.experiment",
     "get_object_networks": "runs.predictor_cache",

@@ -33,9 +33,14 @@ from ..envs.faces import BatchVecEnv, SingleEnv
 from ..imagination.curriculum import Curriculum
 from ..imagination.vec_env import ImaginedGoalVecEnv, imagination_of
 from ..imagination.wrapper import ImaginedGoalWrapper
+from ..reach.vec_env import ReachFirstVecEnv
+from ..reach.wrapper import ReachFirstWrapper
 
 # They watch, some into files, and change nothing that a policy or a replay buffer sees.
 _WATCHERS = (Monitor, RecordVideo, HumanRendering)
+# What acts for the learner in training has no place in a test.
+_HELPERS = (ReachFirstWrapper,)
+_VEC_HELPERS = (ReachFirstVecEnv,)
 # The same; and observations are normalised by the model's own VecNormalize.
 _VEC_WATCHERS = (VecMonitor, VecVideoRecorder, VecNormalize)
 _ASKER = "CurriculumCallback without a test_env"
@@ -60,7 +65,7 @@ def copies_for_tests(training_env: VecEnv) -> VecEnv:
 def _copy_vec_env(env: VecEnv, memo: Memo, curriculum: Curriculum) -> VecEnv:
     if isinstance(env, VecEnvWrapper):
         inner = memo[id(env.venv)] = _copy_vec_env(env.venv, memo, curriculum)
-        if isinstance(env, _VEC_WATCHERS):
+        if isinstance(env, (*_VEC_WATCHERS, *_VEC_HELPERS)):
             return inner
         memo[id(env.class_attributes)] = env.class_attributes  # SB3's notes on the class
         twin = _copy_contents(env, memo)
@@ -83,7 +88,7 @@ def _copy_env(env: gym.Env, memo: Memo, curriculum: Curriculum) -> gym.Env:
     if not isinstance(env, gym.Wrapper):
         return _copy_base(env, memo)
     inner = memo[id(env.env)] = _copy_env(env.env, memo, curriculum)
-    if isinstance(env, _WATCHERS):
+    if isinstance(env, (*_WATCHERS, *_HELPERS)):
         return inner
     if any(isinstance(value, RunningMeanStd) for value in vars(env).values()):
         reason = "it keeps statistics of its own that a copy would not follow; VecNormalize would"
@@ -139,7 +144,7 @@ def _rewrapped(
         wrapped = ImaginedGoalWrapper(env, predictor, curriculum)
         wrapped.mode = "test"
         return wrapped
-    if issubclass(wrapper, _WATCHERS):
+    if issubclass(wrapper, (*_WATCHERS, *_HELPERS)):
         return env
     if layer.kwargs is None:
         reason = "it is in another process and no gymnasium.utils.RecordConstructorArgs"

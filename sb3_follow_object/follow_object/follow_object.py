@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from ..callbacks.curriculum_callback import CurriculumCallback
 from ..callbacks.fresh_episodes import FreshEpisodes, begin_new_episodes
+from ..callbacks.reach_callback import ReachCallback
 from ..common.array_trees import load_tree, save_tree
 from ..common.files import atomic_write
 from ..common.numbers import checked_whole
@@ -34,6 +35,7 @@ from ..object_stage.networks import FILE as OBJECT_FILE
 from ..object_stage.networks import ObjectNetworks
 from ..object_stage.sldr import reads_object_networks
 from ..object_stage.stage import ObjectStage
+from ..reach.vec_env import ReachFirstVecEnv
 from ..settings.fields import checked
 from ..settings.presets import run_config
 from ..settings.run_config import check_plain
@@ -58,6 +60,7 @@ class FollowObject:
         n_threads: of the simulation; by default as many as there are cores.
         reward_type: "sparse" (paper) or "dense".
         algorithm: keyword arguments of the robot's `HerDDPG`.
+        reach: settings of reaching first, {} for their defaults; by default nothing reaches first.
         curriculum: keyword arguments of `Curriculum` besides the horizon.
         object_algorithm: keyword arguments of the object's `HerDDPG`.
         object_on_table: whether the object may not leave the table in the first stage; by default
@@ -93,6 +96,7 @@ class FollowObject:
         n_threads: int | None = StageSettings.n_threads,
         reward_type: str = StageSettings.reward_type,
         algorithm: dict[str, Any] | None = None,
+        reach: dict[str, Any] | None = None,
         curriculum: dict[str, Any] | None = None,
         object_algorithm: dict[str, Any] | None = None,
         object_on_table: bool | None = StageSettings.object_on_table,
@@ -114,6 +118,7 @@ class FollowObject:
             "n_threads": n_threads,
             "reward_type": reward_type,
             "algorithm": algorithm or {},
+            **({} if reach is None else {"reach": reach}),
             "curriculum": curriculum or {},
             "object_algorithm": object_algorithm or {},
             "object_on_table": object_on_table,
@@ -151,6 +156,7 @@ class FollowObject:
         self._checked = False
         self.model: HerDDPG | None = None
         self.curriculum_callback: CurriculumCallback | None = None
+        self.reach_callback: ReachCallback | None = None
         if predictor is not None:
             self.object_stage.use_predictor(predictor)
         if object_networks is not None:
@@ -241,6 +247,10 @@ class FollowObject:
                 every=self.settings["test_every"],
                 store=self.settings["store_tests"],
             )
+        reach = self.settings.get("reach")
+        if reach is not None:
+            self.env = ReachFirstVecEnv(self.env, **reach)
+            self.reach_callback = ReachCallback(stream_seed(self.seed, "reach"), **reach)
         arguments: dict[str, Any] = {"policy": "MultiInputPolicy", **self.settings["algorithm"]}
         stage = self.object_stage
         if stage.needs_networks:
@@ -277,8 +287,8 @@ class FollowObject:
         callbacks: list[BaseCallback] = []
         if env_state(self.env) is None:
             callbacks.append(FreshEpisodes(lambda n: stream_seed(self.seed, f"robot {n}")))
-        if self.curriculum_callback is not None:
-            callbacks.append(self.curriculum_callback)
+        own = (self.reach_callback, self.curriculum_callback)
+        callbacks += [each for each in own if each is not None]
         if isinstance(callback, list):
             callbacks += callback
         elif isinstance(callback, BaseCallback):
@@ -315,6 +325,8 @@ class FollowObject:
             state["model"] = self.model.training_state()
             state["env"] = env_state(self.env)
             state["generators"] = global_generators()
+            if self.reach_callback is not None:
+                state["reach"] = self.reach_callback.state_dict()
             if self.curriculum_callback is not None:
                 state["callback"] = self.curriculum_callback.state_dict()
                 state["test_env"] = env_state(self.curriculum_callback.test_env)
@@ -333,6 +345,8 @@ class FollowObject:
         model = self.prepare()
         model.load_training_state(state["model"])
         set_env_state(self.env, state["env"])
+        if self.reach_callback is not None:
+            self.reach_callback.load_state_dict(state["reach"], model)
         if self.curriculum_callback is not None:
             self.curriculum_callback.load_state_dict(state["callback"])
             set_env_state(self.curriculum_callback.test_env, state["test_env"])

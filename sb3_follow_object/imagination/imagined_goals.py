@@ -119,3 +119,24 @@ def points_along(paths: np.ndarray, shares: np.ndarray) -> np.ndarray:
     length = np.maximum(steps[row, step], np.finfo(np.float64).tiny)
     part = np.clip((wanted - travelled[row, step]) / length, 0.0, 1.0)[..., None]
     return (1.0 - part) * paths[row, step] + part * paths[row, step + 1]
+
+
+def ahead(
+    predictor: GoalPredictor, start: np.ndarray, goal: np.ndarray, distance: float
+) -> np.ndarray:
+    """Return the first points of imagined paths that lie so far from their starts.
+
+    Args:
+        predictor: F_phi.
+        start: object positions o_1, shape (n, 3), metres.
+        goal: original goals g, shape (n, 3), metres.
+        distance: metres.
+
+    Returns:
+        points, shape (n, 3), metres; the end of a path that goes nowhere so far.
+    """
+    paths = predictor.paths(start, goal)
+    far = np.linalg.norm(paths - paths[:, :1], axis=2) >= distance
+    first = np.where(far.any(axis=1), far.argmax(axis=1), paths.shape[1] - 1)
+    points: np.ndarray = paths[np.arange(len(paths)), first]
+    return points

@@ -28,7 +28,7 @@ from .goal_env import (
     terminal_observation,
 )
 from .goal_predictor import GoalPredictor
-from .imagined_goals import draw_goals, imagine
+from .imagined_goals import ahead, draw_goals, imagine
 from .predictor_files import POSITION
 
 let_vec_envs_be_copied()
@@ -76,6 +76,7 @@ class ImaginedGoalVecEnv(WholeCopies, VecEnvWrapper):
         self._shown = np.zeros((venv.num_envs, POSITION), self._dtype)
         self._original = self._shown.copy()
         self._level = np.zeros(venv.num_envs, dtype=np.int64)
+        self._start = np.zeros((venv.num_envs, POSITION))
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the environments and the draw of goals; takes effect at the next reset."""
@@ -181,6 +182,15 @@ class ImaginedGoalVecEnv(WholeCopies, VecEnvWrapper):
     def __reduce__(self) -> tuple[Any, ...]:
         return reduce_vec_wrapper(self)
 
+    def ahead(self, rows: np.ndarray, distance: float) -> np.ndarray:
+        """Return where F_phi sees each episode's object after so much of its way, (m, 3) metres.
+
+        Args:
+            rows: copies whose episodes have just begun, (m,).
+            distance: metres from where the object is.
+        """
+        return ahead(self.predictor, self._start[rows], self._original[rows], distance)
+
     def _draw(self, rows: np.ndarray, obs: Observation) -> None:
         """Give the episodes that start in ``rows`` their goals."""
         for key in ("achieved_goal", "desired_goal"):
@@ -193,6 +203,7 @@ class ImaginedGoalVecEnv(WholeCopies, VecEnvWrapper):
             shown, level = draw_goals(self.predictor, self.curriculum, start, goal, self._rng)
         with np.errstate(under="ignore"):
             self._shown[rows], self._original[rows], self._level[rows] = shown, goal, level
+        self._start[rows] = start
 
     def _ask(self, method: str, *args: Any) -> np.ndarray:
         """Return what the first copy's method says of each row of ``args``."""

@@ -27,7 +27,7 @@ from .goal_env import (
     success_method,
 )
 from .goal_predictor import GoalPredictor
-from .imagined_goals import draw_goals, imagine
+from .imagined_goals import ahead, draw_goals, imagine
 from .predictor_files import POSITION
 
 AUTO = "auto"  # the predictor that is kept for the environment's task, learned where it is not
@@ -85,6 +85,7 @@ class ImaginedGoalWrapper(
         self._rng = np.random.default_rng()
         self._shown = self._original = np.zeros(POSITION, self._dtype)
         self._level = 0
+        self._start = np.zeros(POSITION)
 
     @property
     def predictor(self) -> GoalPredictor:
@@ -105,6 +106,7 @@ class ImaginedGoalWrapper(
             check_shape(obs[key], (POSITION,), f"the observation {key!r}")
         self._original = obs["desired_goal"].copy()
         self._shown, self._level = self._original, 0
+        self._start = np.array(obs["achieved_goal"], dtype=np.float64)
         if self.active:
             shown, level = self._draw(obs["achieved_goal"][None], obs["desired_goal"][None])
             with np.errstate(under="ignore"):
@@ -133,6 +135,15 @@ class ImaginedGoalWrapper(
         """Follow a curriculum that advances elsewhere (``Curriculum.state_dict``), from now on."""
         self.curriculum.load_state_dict(state)
         self.active = True
+
+    def ahead(self, distance: float) -> np.ndarray:
+        """Return where F_phi sees the object after so much of its way, (3,); metres both.
+
+        Where no goals are imagined yet it is the original goal.
+        """
+        if not self.active:
+            return self._original
+        return ahead(self.predictor, self._start[None], self._original[None], distance)[0]
 
     def _draw(self, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the goal shown (1, 3) and its level (1,) in an episode that begins."""

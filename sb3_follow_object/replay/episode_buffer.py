@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from ..settings.sizes import check_buffer
 from .episode_table import EpisodeTable
@@ -12,6 +13,7 @@ from .record_buffer import RecordReplayBuffer
 from .steps import lost_steps
 
 GRAVITY = 9.81  # m/s^2
+EXECUTED = "executed_action"  # in an info: what was done in place of the action given
 
 
 class EpisodeReplayBuffer(RecordReplayBuffer):
@@ -38,9 +40,10 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
     ) -> None:
         """Store one step of every environment; arguments as in HerReplayBuffer.
 
-        A step that does not begin where the last one ended begins another episode: the environment
-        was reset meanwhile. An episode is dropped, so that it is never sampled, whose info says
-        "diverged" at its end, or whose steps were not all stored (`lost_steps`).
+        What an info says was executed is stored in place of the action. A step that does not begin
+        where the last one ended begins another episode: the environment was reset meanwhile. An
+        episode is dropped, so that it is never sampled, whose info says "diverged" at its end, or
+        whose steps were not all stored (`lost_steps`).
 
         Raises:
             ValueError: an array has another shape than the environments', or holds NaN or infinity;
@@ -48,6 +51,8 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         """
         if self.n_added == 0:
             self.check_size()
+        if EXECUTED in infos[0]:
+            action = self._scaled(np.stack([info[EXECUTED] for info in infos]))
         pos = self.pos
         rows = [
             self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
@@ -70,6 +75,12 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         self.full |= self.pos == 0
         self.n_added += 1
         self._end_finished(np.asarray(done, dtype=bool).reshape(self.n_envs), infos)
+
+    def _scaled(self, actions: np.ndarray) -> np.ndarray:
+        """Scale an environment's actions (n_envs, action_dim) to [-1, 1], as they are stored."""
+        assert isinstance(self.action_space, spaces.Box)
+        low, high = self.action_space.low, self.action_space.high
+        return 2.0 * (actions - low) / (high - low) - 1.0
 
     def _end_finished(self, done: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """End the episodes that the step ended; drop those that are not to be sampled."""

@@ -20,7 +20,7 @@ from ..settings.learning import ReplaySettings
 from .cher import GoalSelection
 from .episode_buffer import EpisodeReplayBuffer
 from .episode_table import EpisodeTable
-from .record_buffer import NEXT_DESIRED
+from .record_buffer import NEXT_DESIRED, Gathered
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
 Strategy = GoalSelectionStrategy | str
@@ -325,6 +325,28 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             rewards=self._to_tensor(rewards).reshape(-1, 1),
         )
         return samples, self._to_tensor(steps_to_goal).reshape(-1, 1)
+
+    def sample_pairs(
+        self, n: int, rng: np.random.Generator
+    ) -> tuple[Gathered, Gathered, np.ndarray]:
+        """Draw stored transitions, each with a later one of its episode or itself.
+
+        Args:
+            n: how many.
+            rng: drawn from in place of the buffer's own generator.
+
+        Returns:
+            the transitions, the later ones, and how many steps later these are, (n,) int.
+        """
+        row, step = self.table.draw(n, rng)
+        episode = self.table.facts.take(row, axis=0)
+        later = rng.integers(episode[:, 2] - step)
+        first, then = (self._flat(episode, at) for at in (step, step + later))
+        return (
+            self._gather(first, self._achieved_goals(first)),
+            self._gather(then, self._achieved_goals(then)),
+            later,
+        )
 
     def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         row, step = self.table.draw(n, self.rng)

@@ -78,6 +78,15 @@ def _strategy(value: Any) -> Any:
     raise ValueError
 
 
+def _indices(value: Any) -> tuple[int, ...]:
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise ValueError
+    numbers = tuple(as_whole(index) for index in value)
+    if min(numbers) < 0:
+        raise ValueError
+    return numbers
+
+
 def _policy(value: Any) -> Any:
     if isinstance(value, type) or value == "MultiInputPolicy":
         return value
@@ -104,6 +113,7 @@ TargetClip = Annotated[
 ]
 Rate = Annotated[Any, BeforeValidator(_rate), Said("a number in (0, inf)")]
 Strategy = Annotated[Any, BeforeValidator(_strategy), Said("'future', 'final' or 'episode'")]
+Indices = Annotated[Any, BeforeValidator(_indices), Said("three whole numbers of at least 0")]
 Policy = Annotated[Any, BeforeValidator(_policy), Said("MultiInputPolicy")]
 PythonClass = Annotated[type, Said("a class, which only Python code can give")]
 Reward = Annotated[Any, Said("rnd, sldr or a subclass of `AuxiliaryReward`")]

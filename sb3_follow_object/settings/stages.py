@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from .fields import Flag, Group, Number, Whole, setting
+from .kinds import Indices
 from .learning import AlgorithmSettings, InverseSettings, PredictorSettings
 
 COPIES, THREADS = 4096, 1024  # what is more would fill the memory
@@ -53,6 +54,42 @@ class CurriculumTestSettings(Group):
 
 
 @dataclass(frozen=True)
+class ReachSettings(Group):
+    """How the effector reaches for the object before the learner acts."""
+
+    title = "`reach`, of `ReachFirstVecEnv` and `ReachCallback`"
+    where = "reach"
+    share: Annotated[
+        Number, setting("of the episodes that begin with reaching at first", ge=0, le=1)
+    ] = 0.5
+    fade: Annotated[
+        Flag, setting("whether the share falls as the learner comes to the object by itself")
+    ] = True
+    effector: Annotated[Indices, setting("where the observation holds the effector's position")] = (
+        0,
+        1,
+        2,
+    )
+    tolerance: Annotated[
+        Number, setting("within which the effector has arrived", unit="metres", gt=0)
+    ] = 0.03
+    height: Annotated[
+        Number, setting("above the place that it is taken to first", unit="metres", ge=0)
+    ] = 0.1
+    standoff: Annotated[
+        Number, setting("of the place behind the object, as its way goes", unit="metres", ge=0)
+    ] = 0.0
+    noise: Annotated[
+        Number, setting("standard deviation on each action while it reaches", ge=0)
+    ] = 0.1
+    max_steps: Annotated[Whole, setting("after which the learner acts all the same", ge=1)] = 25
+    n_updates: Annotated[
+        Whole, setting("gradient steps of the reach policy after a rollout", ge=1)
+    ] = 40
+    batch_size: Annotated[Whole, setting("transitions of each of them", ge=1, le=10**6)] = 256
+
+
+@dataclass(frozen=True)
 class StageSettings(Group):
     """The three stages (`FollowObject`)."""
 
@@ -71,6 +108,10 @@ class StageSettings(Group):
     algorithm: Annotated[
         dict[str, Any] | None,
         setting("of the robot's algorithm", none="{}", group=AlgorithmSettings, data=False),
+    ] = None
+    reach: Annotated[
+        dict[str, Any] | None,
+        setting("reaching for the object first", none="no reaching", group=ReachSettings),
     ] = None
     curriculum: Annotated[
         dict[str, Any] | None,

@@ -1,0 +1,75 @@
+"""Reaching first in one gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ..replay.episode_buffer import EXECUTED
+from ..settings.stages import ReachSettings
+from .actor import ReachActor
+from .approach import AHEAD, STREAM, Approach, Observation, check_reachable
+
+
+class ReachFirstWrapper(
+    gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray], gym.utils.RecordConstructorArgs
+):
+    """Let the effector reach for the object first in a share of the episodes.
+
+    While it reaches, the actions given are replaced; infos carry "executed_action", which
+    `FollowObjectReplayBuffer` stores. Nothing reaches until a `ReachCallback` has taught the reach
+    policy, so the same YAML makes the environment that trains and those that evaluate or play. Put
+    it outside of ImaginedGoalWrapper.
+
+    Args:
+        env: environment with Dict goal observations.
+        settings: of `ReachSettings`.
+
+    Raises:
+        ValueError: the observations do not hold the effector where the settings say.
+    """
+
+    def __init__(self, env: gym.Env, **settings: Any) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self, **settings)
+        super().__init__(env)
+        reach = ReachSettings(**settings)
+        check_reachable(env.observation_space, reach)
+        self.approach = Approach(1, reach)
+        self._obs: Observation = {}
+
+    def set_reach(self, actor: ReachActor, share: float) -> None:
+        """Reach with this policy from now on, in this share of the episodes that begin."""
+        self.approach.actor = actor
+        self.approach.share = share
+
+    def take_counts(self) -> np.ndarray:
+        """Return what `Approach.counts` has had since the last call, (4,) int."""
+        return self.approach.take_counts()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode, perhaps with reaching."""
+        if seed is not None:
+            self.approach.rng = np.random.default_rng([seed, STREAM])
+        obs, info = self.env.reset(seed=seed, options=options)
+        self._obs = _batch_of_one(obs)
+        ahead = self._obs["desired_goal"]
+        if self.approach.settings.standoff and self.has_wrapper_attr("ahead"):
+            ahead = self.get_wrapper_attr("ahead")(AHEAD)[None]
+        self.approach.begin(np.arange(1), self._obs, ahead)
+        return obs, info
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Step with what is executed, and tell it in the info."""
+        executed = self.approach.act(self._obs, np.asarray(action)[None])[0]
+        obs, reward, terminated, truncated, info = self.env.step(executed)
+        self._obs = _batch_of_one(obs)
+        self.approach.arrive(self._obs, np.array([terminated or truncated]))
+        return obs, float(reward), terminated, truncated, {**info, EXECUTED: executed}
+
+
+def _batch_of_one(obs: Observation) -> Observation:
+    return {key: np.asarray(value)[None] for key, value in obs.items()}
