@@ -66,11 +66,11 @@ def test_grid_runs_on_two_nodes_and_its_files_come_back(
 def test_run_that_raises_on_a_node_is_tried_twice_and_reported(
     cluster: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["compare", "--out", str(tmp_path), "--tasks", "PushSideGap", "--methods", "her"]
-    words += ["--steps", "600", "--ray", cluster.address, "--set", *TINY, "noise_std=-1.0"]
+    words = ["compare", "--out", str(tmp_path), "--tasks", "PushSideGap", "--methods", "cher"]
+    words += ["--steps", "600", "--ray", cluster.address, "--set", *TINY, "replay_on_device=true"]
     assert main(words) == 2
     printed = capsys.readouterr()
-    assert "1 of 1 runs failed: PushSideGap-her-0" in printed.err
+    assert "1 of 1 runs failed: PushSideGap-cher-0" in printed.err
     assert "it failed twice" in printed.out
     assert "| PushSideGap | failed |" in printed.out
 
@@ -95,7 +95,7 @@ def test_ray_that_is_not_installed_is_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def missing(module: str) -> None:
-        raise ImportError(module)
+        raise ModuleNotFoundError(module, name=module)
 
     monkeypatch.setattr(extras, "import_module", missing)
     words = ["compare", "--out", str(tmp_path / "new"), "--tasks", "PushSideGap"]

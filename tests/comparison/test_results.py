@@ -119,7 +119,7 @@ def test_bootstrap_is_stratified() -> None:
 
 def test_tables_do_without_rliable(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(module: str) -> None:
-        raise ImportError(module)
+        raise ModuleNotFoundError(module, name=module.split(".")[0])
 
     monkeypatch.setattr(extras, "import_module", missing)
     groups = group_runs(read_results(results))

@@ -206,7 +206,10 @@ def test_a_callback_says_that_no_goals_are_imagined() -> None:
     [
         ({"curriculum": {"kmax": 3}}, "kmax"),
         ({"curriculum": {"p": 2.0}}, r"p is 2.0; it must lie in \[0, 1\]"),
-        ({"curriculum": {"k_max": HORIZON + 1}}, f"in 1..{HORIZON}"),
+        (
+            {"curriculum": {"k_max": HORIZON + 1}},
+            f"k_max is {HORIZON + 1}; it must be at most {HORIZON}",
+        ),
     ],
 )
 def test_wrong_settings_are_a_sentence(options: dict[str, Any], sentence: str) -> None:
