@@ -1,4 +1,4 @@
-"""How an action is changed for exploration: Gaussian noise, and now and then any other action."""
+"""How an action is changed to explore: Gaussian noise, and now and then any other action."""
 
 from __future__ import annotations
 

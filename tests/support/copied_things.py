@@ -26,6 +26,8 @@ from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
+from sb3_follow_object.reach.vec_env import ReachFirstVecEnv
+from sb3_follow_object.reach.wrapper import ReachFirstWrapper
 from sb3_follow_object.replay.episode_table import EpisodeTable
 from sb3_follow_object.replay.records import Records
 
@@ -312,6 +314,14 @@ THINGS: dict[str, tuple[Make, Use]] = {
     "ImaginedGoalVecEnv, 2 threads": (lambda: begun_batch(imagined_batch(2)), play_batch),
     "VecMonitor": (lambda: begun_batch(VecMonitor(imagined_batch(2))), play_batch),
     "VecFrameStack": (lambda: begun_batch(VecFrameStack(imagined_batch(1), 2)), play_batch),
+    "ReachFirstWrapper": (
+        lambda: begun_single(ReachFirstWrapper(gym.make(ROBOT))),
+        play_single,
+    ),
+    "ReachFirstVecEnv": (
+        lambda: begun_batch(ReachFirstVecEnv(imagined_batch(2))),
+        play_batch,
+    ),
     "GoalPredictor": (fitted_predictor, use_predictor),
     "Curriculum": (lambda: toy.curriculum(k_max=3), use_curriculum),
     "FollowObjectReplayBuffer": (filled_buffer, use_buffer),
