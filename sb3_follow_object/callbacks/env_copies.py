@@ -39,11 +39,11 @@ from ..reach.wrapper import ReachFirstWrapper
 
 # They watch, some into files, and change nothing that a policy or a replay buffer sees.
 _WATCHERS = (Monitor, RecordVideo, HumanRendering)
+# The same; and observations are normalised by the model's own VecNormalize.
+_VEC_WATCHERS = (VecMonitor, VecVideoRecorder, VecNormalize)
 # What acts for the learner in training has no place in a test.
 _HELPERS = (ReachFirstWrapper,)
 _VEC_HELPERS = (ReachFirstVecEnv,)
-# The same; and observations are normalised by the model's own VecNormalize.
-_VEC_WATCHERS = (VecMonitor, VecVideoRecorder, VecNormalize)
 _ASKER = "CurriculumCallback without a test_env"
 
 Memo = dict[int, Any]  # of copy.deepcopy: what stands for an object, by the object's id
