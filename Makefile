@@ -8,10 +8,18 @@ INSTALLED := $(VENV)/.installed
 ENV ?= FollowObject/PnPShelf-v0
 RUN ?= runs/pnp-shelf
 
-.PHONY: train test lint bench test-mujoco-range test-foreign clean
+.PHONY: train quick test lint settings bench test-mujoco-range test-foreign clean
 
 train: $(INSTALLED)
 	$(BIN)/sb3-follow-object train --env $(ENV) --run $(RUN) --set torch_threads=2 --resume-or-start
+
+# What breaks most when a room changes, within a minute together with the linters.
+QUICK := tests/settings tests/imagination tests/callbacks/test_callbacks.py tests/envs/test_tasks.py \
+	tests/replay/test_her_replay_buffer.py tests/replay/test_record_buffer.py \
+	tests/ddpg/test_her_ddpg.py
+
+quick: lint
+	$(BIN)/pytest -q -n 2 --dist loadgroup -k "not learns and not stock and not subprocesses" $(QUICK)
 
 test: lint
 	$(BIN)/pytest -q -n 2 --dist loadgroup
@@ -38,7 +46,11 @@ lint: $(INSTALLED)
 	@cp -r sb3_follow_object build/package/
 	@cp -r envs zoo_configs build/package/sb3_follow_object/
 	MYPYPATH=build/package $(BIN)/mypy -p sb3_follow_object
-	cd build/package && $(abspath $(BIN))/lint-imports --no-cache --config $(CURDIR)/pyproject.toml
+	cd build/package && $(abspath $(BIN))/lint-imports --no-cache --no-logo $(CURDIR)/pyproject.toml
+
+# The tables of settings in the docs are what the code says.
+settings: $(INSTALLED)
+	$(BIN)/python -m sb3_follow_object.settings.table docs/runs.md
 
 # torch goes first and by its pin: a range would let pip fetch a newer build with CUDA.
 $(INSTALLED): pyproject.toml constraints.txt

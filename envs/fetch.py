@@ -97,7 +97,7 @@ class FetchSimulation(BatchedSimulation):
 
 
 class FetchEnv(SingleEnv):
-    """One robot task as a gymnasium.Env with Dict observations (paper, section 4).
+    """One robot task as a gymnasium.Env with Dict observations (paper, section 5.1).
 
     Args:
         task: key in `TASKS`, or a row of one's own.

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
+from gymnasium import spaces
 
 from ..common.suggestions import did_you_mean
 from .registration import import_task
@@ -29,11 +32,9 @@ def check_task(env_id: str) -> str:
     except Exception as error:  # an environment of somebody's may raise anything
         raise ValueError(f"{env_id!r} cannot be made: {error or type(error).__name__}") from error
     try:
-        missing = set(_GOAL_KEYS) - set(getattr(env.observation_space, "spaces", {}))
+        missing = missing_goal_keys(env.observation_space)
         if missing:
-            raise ValueError(
-                f"{env_id!r} has no goals: its observations lack {', '.join(sorted(missing))}"
-            )
+            raise ValueError(f"{env_id!r} has no goals: its observations lack {', '.join(missing)}")
         if env.spec is None or env.spec.max_episode_steps is None:
             raise ValueError(f"{env_id!r} does not say how long its episodes are")
         if _hides_success(env):
@@ -56,6 +57,19 @@ def _hides_success(env: gym.Env) -> bool:
         return True
     except Exception:  # an environment of somebody's may raise anything; training will tell it
         return False
+
+
+def missing_goal_keys(space: spaces.Space) -> list[str]:
+    """Return what observations lack of a goal environment's, in the alphabet's order."""
+    return sorted(set(_GOAL_KEYS) - set(space.spaces if isinstance(space, spaces.Dict) else ()))
+
+
+def episode_steps(env: Any) -> int | None:
+    """Return T, steps of an episode, of a VecEnv that tells it in its spec."""
+    if not env.has_attr("spec"):
+        return None
+    spec = env.get_attr("spec", indices=[0])[0]
+    return None if spec is None or spec.max_episode_steps is None else int(spec.max_episode_steps)
 
 
 def known_id(env_id: str) -> str:

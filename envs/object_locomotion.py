@@ -1,4 +1,4 @@
-"""The object alone, moved by a mocap body it is welded to (section 3.1 of the paper)."""
+"""The object alone, moved by a mocap body it is welded to (section 4.1 of the paper)."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def object_only(spec: mujoco.MjSpec, body_name: str) -> mujoco.MjSpec:
     """A scene with one free body and without the robot: the body is welded to a new mocap body.
 
     What stands still stays, other free bodies too. Articulated bodies and the mocap bodies that
-    pull them go, and with them actuators, sensors, tendons, equalities, keyframes (section 3.1).
+    pull them go, and with them actuators, sensors, tendons, equalities, keyframes (section 4.1).
 
     Args:
         spec: any scene; it is not changed.

@@ -1,4 +1,4 @@
-"""The paper's tasks, one row each (section 4, Experiments), and the gymnasium ids that they have.
+"""The paper's tasks, one row each (section 5.1), and the gymnasium ids that they have.
 
 A task has a pair of ids: `FollowObject/<Task>-v0` of the robot, `FollowObject/<Task>Object-v0` of
 its object alone.

@@ -1,1 +1,1 @@
-"""Rollouts without noise, the curriculum's tests at h_max (Algorithm 1), and validation."""
+"""Rollouts without noise, tests at h_max (Algorithm 1), validation, and reaching that fades."""

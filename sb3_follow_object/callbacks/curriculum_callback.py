@@ -12,12 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped, unwrap_v
 from ..ddpg.whole_episodes import WholeEpisodesDDPG
 from ..imagination.curriculum import Curriculum
 from ..imagination.vec_env import ImaginedGoalVecEnv, imagination_of
-from ..replay.following import (
-    check_size,
-    end_running_episodes,
-    episodes_are_whole,
-    follow_env,
-)
+from ..replay.following import end_running_episodes, episodes_are_whole, follow_env
 from ..settings.stages import CurriculumTestSettings
 from .copyable import CopyableCallback
 from .env_copies import copies_for_tests
@@ -133,7 +128,6 @@ class CurriculumCallback(CopyableCallback):
             _check_curriculum(self.training_env, self.curriculum)
         buffer = getattr(self.model, "replay_buffer", None)
         if buffer is not None:
-            check_size(buffer, self.training_env)
             follow_env(buffer, self.training_env)
 
     def _is_outdated_copy(self) -> bool:

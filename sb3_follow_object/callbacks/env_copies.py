@@ -29,6 +29,7 @@ from stable_baselines3.common.vec_env import (
     VecVideoRecorder,
 )
 
+from ..common.reports import named_reason
 from ..envs.faces import BatchVecEnv, SingleEnv
 from ..imagination.curriculum import Curriculum
 from ..imagination.vec_env import ImaginedGoalVecEnv, imagination_of
@@ -38,11 +39,11 @@ from ..reach.wrapper import ReachFirstWrapper
 
 # They watch, some into files, and change nothing that a policy or a replay buffer sees.
 _WATCHERS = (Monitor, RecordVideo, HumanRendering)
+# The same; and observations are normalised by the model's own VecNormalize.
+_VEC_WATCHERS = (VecMonitor, VecVideoRecorder, VecNormalize)
 # What acts for the learner in training has no place in a test.
 _HELPERS = (ReachFirstWrapper,)
 _VEC_HELPERS = (ReachFirstVecEnv,)
-# The same; and observations are normalised by the model's own VecNormalize.
-_VEC_WATCHERS = (VecMonitor, VecVideoRecorder, VecNormalize)
 _ASKER = "CurriculumCallback without a test_env"
 
 Memo = dict[int, Any]  # of copy.deepcopy: what stands for an object, by the object's id
@@ -158,7 +159,7 @@ def _make(spec: EnvSpec) -> gym.Env:
     try:
         return gym.make(spec, **windowless)
     except Exception as error:  # an environment of somebody's may raise anything
-        raise _cannot(spec.id, f"making it again failed ({_one_line(error)})") from error
+        raise _cannot(spec.id, f"making it again failed ({named_reason(error)})") from error
 
 
 def _copy(env: Any, memo: Memo) -> Any:
@@ -166,7 +167,7 @@ def _copy(env: Any, memo: Memo) -> Any:
     try:
         twin = copy.deepcopy(env, memo)
     except Exception as error:  # what somebody's holds may raise anything
-        raise _cannot(type(env).__name__, _one_line(error)) from error
+        raise _cannot(type(env).__name__, named_reason(error)) from error
     if isinstance(env, EzPickle):  # made again from its arguments
         _check_alike(type(env).__name__, twin, lambda: _settings(twin), _settings(env))
     return twin
@@ -178,7 +179,7 @@ def _copy_contents(env: Any, memo: Memo) -> Any:
     try:
         vars(twin).update(copy.deepcopy(vars(env), memo))
     except Exception as error:
-        raise _cannot(type(env).__name__, _one_line(error)) from error
+        raise _cannot(type(env).__name__, named_reason(error)) from error
     return twin
 
 
@@ -269,7 +270,3 @@ def _cannot(what: str, reason: str) -> ValueError:
         f"CurriculumCallback cannot copy {what} of the training's environment ({reason}): give it "
         "a test_env with the same wrappers and settings."
     )
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())

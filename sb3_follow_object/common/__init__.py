@@ -1,1 +1,1 @@
-"""Helpers that know nothing of learning: files, trees of arrays, YAML, seeds, reports."""
+"""Helpers that know nothing of learning: files, trees of arrays, YAML, seeds, copies, signals."""

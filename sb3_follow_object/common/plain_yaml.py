@@ -6,6 +6,8 @@ from typing import Any
 
 import yaml
 
+from .reports import reason
+
 SIZE_LIMIT = 1 << 17  # characters
 NODES_LIMIT = 20_000  # after every alias has been replaced by what it stands for
 DEPTH_LIMIT = 32
@@ -30,7 +32,7 @@ def load_yaml(text: str) -> Any:
         # Merging copies what is merged, so its size has to be known by now.
         value = yaml.constructor.SafeConstructor().construct_document(node)
     except yaml.YAMLError as error:
-        raise ValueError(" ".join(str(error).split())) from error
+        raise ValueError(reason(error)) from error
     except RecursionError as error:
         raise ValueError(f"it is nested more than {DEPTH_LIMIT} deep") from error
     except (AttributeError, KeyError, OverflowError, TypeError) as error:  # !!timestamp, !!binary

@@ -15,6 +15,12 @@ def reason(error: BaseException) -> str:
     return " ".join(text.split()) or type(error).__name__
 
 
+def named_reason(error: BaseException) -> str:
+    """Return an error's kind and what it says, in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
 class Trouble(str):
     """A sentence about what went wrong, which `--quiet` does not silence."""
 

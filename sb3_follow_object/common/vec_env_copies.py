@@ -17,6 +17,8 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
+from .copies import WholeCopies
+
 _WRAPPERS: tuple[Any, ...] = (
     VecCheckNan,
     VecExtractDictObs,
@@ -49,6 +51,13 @@ def reduce_vec_wrapper(env: VecEnvWrapper) -> tuple[Any, ...]:
         )
     contents = {name: value for name, value in vars(env).items() if name != "class_attributes"}
     return _vec_wrapper, (type(env), contents)
+
+
+class CopyableVecEnvWrapper(WholeCopies, VecEnvWrapper):
+    """A VecEnvWrapper that copy and pickle can copy."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduce_vec_wrapper(self)
 
 
 def _vec_wrapper(kind: type[VecEnvWrapper], contents: dict[str, Any]) -> VecEnvWrapper:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import os
-import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from ..common.reports import Trouble, reason
+from ..common.signals import stop_signals_to
 from ..runs.run_folder import POLICY, trained_steps
 from .cross import partner, read_cross_tests
 from .executors import Executor, Message
@@ -86,7 +83,7 @@ class Comparison:
             over = cell.finished or self._ledger.failed(cell.name)
             total = 0 if over else cell.config.total_timesteps
             self._display.expect(cell.name, total, trained_steps(cell.folder) or 0)
-        with _stop_on_signals(self._request_stop):
+        with stop_signals_to(self._request_stop):
             try:
                 self._fill()
                 while self._jobs:
@@ -204,24 +201,6 @@ class Comparison:
             last = self._failures[name] >= ATTEMPTS
         again = "it failed twice and is given up" if last else "it is taken up once more"
         self._display.say(Trouble(f"{name} failed: {error}; {again}"))
-
-
-@contextmanager
-def _stop_on_signals(request: Callable[[], None]) -> Iterator[None]:
-    """Call `request` on SIGINT and SIGTERM."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may set handlers; its owner stops us otherwise
-        return
-
-    def handle(signum: int, frame: Any) -> None:
-        request()
-
-    earlier = {sig: signal.signal(sig, handle) for sig in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for sig, handler in earlier.items():
-            signal.signal(sig, handler)
 
 
 def write_report(folder: Path, say: Callable[[str], None]) -> None:

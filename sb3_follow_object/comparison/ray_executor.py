@@ -16,10 +16,11 @@ from typing import Any
 from ..common.copies import NoCopies
 from ..common.extras import need
 from ..common.files import atomic_write, lock
+from ..common.reports import named_reason
 from ..runs.object_stage_files import OBJECT_STAGE
 from ..runs.run_folder import RESULT
 from .executors import Message
-from .worker import Job, one_line, run_job
+from .worker import Job, run_job
 
 LOCAL = "local"
 
@@ -104,7 +105,7 @@ class RayExecutor(NoCopies):
                     _write_files(Path(job.folder), files, gone)
                 # Its process or its node is gone, or there is no room for its files here.
                 except (self._ray.exceptions.RayError, OSError) as error:
-                    outcome = {"failed": one_line(error)}
+                    outcome = {"failed": named_reason(error)}
             told.append((job.name, outcome))
         return told
 
@@ -173,7 +174,7 @@ def _work(
         except KeyboardInterrupt:
             outcome = {"stopped": True}
         except Exception as error:
-            outcome = {"failed": one_line(error)}
+            outcome = {"failed": named_reason(error)}
         left = _read_files(folder)
         return outcome, left, set(files) - set(left)
 

@@ -19,6 +19,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ..common.reports import named_reason
+
 STAGE, TRAIN, CROSS = "stage", "train", "cross"
 FAILURE, INTERRUPTED = 1, 130
 
@@ -86,12 +88,6 @@ def run_job(job: Job, send: Send) -> None:
     )
 
 
-def one_line(error: BaseException) -> str:
-    """Return what went wrong as one line."""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
 def main() -> int:
     """Do the job on standard input; return 0, 1 when it failed, 130 when it was stopped."""
     job = Job(**json.loads(sys.stdin.readline()))
@@ -110,7 +106,7 @@ def main() -> int:
         return INTERRUPTED
     except Exception as error:
         traceback.print_exc()
-        send({"failed": one_line(error)})
+        send({"failed": named_reason(error)})
         return FAILURE
     return 0
 

@@ -11,6 +11,7 @@ from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from ..common.array_trees import load_tree, save_tree
+from ..common.reports import reason
 from ..common.torch_helpers import usual_defaults
 from .policies import NormalizedGoalExtractor
 
@@ -82,8 +83,9 @@ def load_actor(
         actor.set_training_mode(False)
         return actor, str(saved["env_id"])
     except (AttributeError, KeyError, TypeError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{path} is not a policy for this environment ({reason})") from error
+        raise ValueError(
+            f"{path} is not a policy for this environment ({reason(error)})"
+        ) from error
 
 
 def _check_layers(tensors: dict[str, th.Tensor], widths: list[int]) -> None:

@@ -10,7 +10,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
@@ -20,21 +19,19 @@ from stable_baselines3.common.type_aliases import (
     TrainFreq,
     TrainFrequencyUnit,
 )
-from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from ..common.answers import check_shape
-from ..common.copies import WholeCopies
 from ..common.numbers import checked_whole
 from ..common.torch_helpers import matmul_at, threads_at, usual_defaults
 from ..replay.device_replay import DeviceReplay, device_replay_of
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
 from ..settings.learning import AlgorithmSettings
-from .auxiliary import AuxiliaryCritic, Transitions, make_auxiliary, resolve_auxiliary
+from .auxiliary import Transitions, make_auxiliary, resolve_auxiliary
+from .env_checks import check_goals, check_rewards, check_wrappers, horizon_of
+from .exploration import explored
 from .input_moments import InputMoments
+from .kept_state import KeptDDPG
 from .policies import HerPolicy
 from .updates import COLUMNS, Updates
-from .whole_episodes import WholeEpisodesDDPG
 
 SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 
@@ -44,7 +41,7 @@ _SAMPLE_CHUNK = 32_768
 _DEVICE_CHUNK = 262_144
 
 
-class HerDDPG(WholeCopies, WholeEpisodesDDPG):
+class HerDDPG(KeptDDPG):
     """DDPG as the HER papers run it: normaliser, target clip, action L2, random actions.
 
     The differences from SB3's DDPG (section 3.2 of the paper and its references):
@@ -101,8 +98,6 @@ class HerDDPG(WholeCopies, WholeEpisodesDDPG):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": HerPolicy}
-    _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
-    policy: HerPolicy
     replay_buffer: FollowObjectReplayBuffer | None
 
     def __init__(
@@ -204,21 +199,15 @@ class HerDDPG(WholeCopies, WholeEpisodesDDPG):
         self.matmul_precision: str = settings.matmul_precision
         self.update_threads = settings.update_threads
         self.auxiliary = settings.auxiliary
-        self.auxiliary_critic: AuxiliaryCritic | None = None
+        self.auxiliary_critic = None
         self.replay_on_device = settings.replay_on_device
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
-        keys = getattr(self.observation_space, "spaces", {})
-        missing = {"observation", "achieved_goal", "desired_goal"} - set(keys)
-        if missing:
-            raise ValueError(
-                f"the environment's observations lack {', '.join(sorted(missing))}; HerDDPG needs "
-                "a goal environment with observation, achieved_goal and desired_goal"
-            )
+        check_goals(self.observation_space)
         if self.gamma is None:
-            self.gamma = 1.0 - 1.0 / self._horizon()
+            self.gamma = 1.0 - 1.0 / horizon_of(self.env)
         self._check_env(self.env)
         if self.auxiliary is not None:
             self.auxiliary = resolve_auxiliary(self.auxiliary, self.env)
@@ -240,7 +229,7 @@ class HerDDPG(WholeCopies, WholeEpisodesDDPG):
         if isinstance(self.train_freq, TrainFreq) and (
             self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1
         ):
-            steps = self.train_freq.frequency * self._horizon()
+            steps = self.train_freq.frequency * horizon_of(self.env)
             self.train_freq = TrainFreq(steps, TrainFrequencyUnit.STEP)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
@@ -256,16 +245,7 @@ class HerDDPG(WholeCopies, WholeEpisodesDDPG):
     def _check_env(self, env: Any) -> None:
         if env is None:
             return
-        if unwrap_vec_normalize(env) is not None:
-            raise ValueError(
-                "HerDDPG standardises its inputs itself and knows the range of its rewards; leave "
-                "VecNormalize (rl_zoo3's normalize) out"
-            )
-        if is_vecenv_wrapped(env, VecFrameStack):
-            raise ValueError(
-                "VecFrameStack (rl_zoo3's frame_stack) stacks goals too, for which the environment "
-                "has no reward; leave it out"
-            )
+        check_wrappers(env)
         if self.auxiliary is not None:
             resolve_auxiliary(self.auxiliary, env)
 
@@ -274,17 +254,6 @@ class HerDDPG(WholeCopies, WholeEpisodesDDPG):
         super().set_env(env, force_reset)
         if makes_replay:
             self._device_replay = self._make_device_replay()
-
-    def _horizon(self) -> int:
-        """Steps of an episode, from the environment's spec."""
-        assert self.env is not None
-        spec = self.env.get_attr("spec", indices=[0])[0]
-        if spec is None or spec.max_episode_steps is None:
-            raise ValueError(
-                "the environment does not say how long its episodes are (spec.max_episode_steps); "
-                "give gamma and train_freq in steps"
-            )
-        return int(spec.max_episode_steps)
 
     def _sample_action(
         self,
@@ -300,15 +269,8 @@ class HerDDPG(WholeCopies, WholeEpisodesDDPG):
         else:
             action, _ = self.actor.predict(self._last_obs, deterministic=True)
             scaled = self.policy.scale_action(action)
-            if action_noise is None:
-                noise = self.rng.normal(0.0, self.noise_std, size=scaled.shape)
-            else:
-                noise = np.asarray(action_noise())
-                noise = noise[None] if n_envs == 1 and noise.ndim == 1 else noise
-                check_shape(noise, scaled.shape, "action_noise")
-            scaled = np.clip(scaled + noise, -1.0, 1.0)
-            random = self.rng.random(n_envs) < self.random_action_prob
-            scaled[random] = self.rng.uniform(-1.0, 1.0, size=(random.sum(), *scaled.shape[1:]))
+            noise = self.noise_std if action_noise is None else action_noise
+            scaled = explored(scaled, noise, self.random_action_prob, self.rng)
         with np.errstate(under="ignore"):
             scaled = scaled.astype(np.float32)
         return self.policy.unscale_action(scaled), scaled
@@ -321,75 +283,6 @@ class HerDDPG(WholeCopies, WholeEpisodesDDPG):
                 th.as_tensor(self.moments.mean, dtype=th.float32),
                 th.as_tensor(self.moments.std, dtype=th.float32),
             )
-
-    def _buffer_was_replaced(self, buffer: ReplayBuffer) -> None:
-        self.moments.buffer_was_loaded(buffer)
-
-    def __getstate__(self) -> dict[str, Any]:
-        state = vars(self).copy()
-        if "_logger" in state:  # its files and terminal are the original's
-            state |= {"_logger": Logger(None, []), "_custom_logger": False}
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        buffer = self.replay_buffer
-        if isinstance(buffer, HerReplayBuffer) and buffer.env is None and self.env is not None:
-            buffer.set_env(self.env)  # a pickled buffer leaves it out
-
-    def _excluded_save_params(self) -> list[str]:
-        names = ("auxiliary_critic", "_updates", "_device_replay")
-        return [*super()._excluded_save_params(), *names]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        names, variables = super()._get_torch_save_params()
-        if self.auxiliary_critic is not None:
-            names.append("auxiliary_critic")
-            names += [f"auxiliary_critic.{name}" for name in self.auxiliary_critic.optimizers]
-        return names, variables
-
-    def training_state(self) -> dict[str, Any]:
-        """Return everything that the next rollout and update depend on, between rollouts.
-
-        The environment has its own state, and so has the replay buffer.
-        """
-        return {
-            "policy": self.policy.state_dict(),
-            "actor_optimizer": self.actor.optimizer.state_dict(),
-            "critic_optimizer": self.critic.optimizer.state_dict(),
-            "auxiliary": None
-            if self.auxiliary_critic is None
-            else self.auxiliary_critic.training_state(),
-            "moments": self.moments.state_dict(),
-            "rng": self.rng.bit_generator.state,
-            "device_rng": None
-            if self._device_replay is None
-            else self._device_replay.generator.get_state(),
-            "last_obs": None if self._step_is_open else self._last_obs,
-            "counters": {name: getattr(self, name) for name in self._COUNTERS},
-        }
-
-    def load_training_state(self, state: dict[str, Any]) -> None:
-        """Continue from `training_state` of an algorithm with the same networks."""
-        self.policy.load_state_dict(state["policy"])
-        self.actor.optimizer.load_state_dict(state["actor_optimizer"])
-        self.critic.optimizer.load_state_dict(state["critic_optimizer"])
-        if self.auxiliary_critic is not None:
-            self.auxiliary_critic.load_training_state(state["auxiliary"])
-        assert self.replay_buffer is not None
-        self.moments.load_state_dict(state["moments"], self.replay_buffer)
-        self.rng.bit_generator.state = state["rng"]
-        if self._device_replay is not None and state["device_rng"] is not None:
-            self._device_replay.generator.set_state(state["device_rng"])
-        self._last_obs = state["last_obs"]
-        self._last_episode_starts = np.ones(self.n_envs, dtype=bool)
-        for name in self._COUNTERS:
-            setattr(self, name, state["counters"][name])
-
-    def expect_new_replay(self) -> None:
-        """Take in for the moments what is stored from now on: the replay buffer begins anew."""
-        assert self.replay_buffer is not None
-        self.moments.begin_anew(self.replay_buffer)
 
     def _target_bounds(self) -> tuple[float, float]:
         if self.target_clip == "auto":
@@ -424,7 +317,7 @@ class HerDDPG(WholeCopies, WholeEpisodesDDPG):
         for n in self._chunks(gradient_steps, batch_size):
             data, steps_to_goal = self._sample(n * batch_size, n)
             if self._n_updates == 0 and self._device_replay is None:
-                self._check_rewards(data.rewards)
+                check_rewards(data.rewards, self.target_clip == "auto", self.hindsight_bound)
             bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
             # All networks share their input moments, so features are computed once.
             chunk = Transitions(
@@ -461,18 +354,6 @@ class HerDDPG(WholeCopies, WholeEpisodesDDPG):
                 raise
             warnings.warn(f"Replay goes on on the host: {error}.", stacklevel=2)
             self._device_replay = None
-
-    def _check_rewards(self, rewards: th.Tensor) -> None:
-        """Refuse rewards for which "auto" or hindsight_bound would bound the targets wrongly."""
-        if self.target_clip == "auto" and float(rewards.max()) > 0.0:
-            raise ValueError(
-                f"a reward is {float(rewards.max()):g}; target_clip 'auto' is for none above "
-                "0: give (low, high), the bounds of the returns, or None"
-            )
-        if self.hindsight_bound and not bool(((rewards == 0.0) | (rewards == -1.0)).all()):
-            raise ValueError(
-                "hindsight_bound is for rewards of -1 and 0, and one is another; set it to false"
-            )
 
     def _chunks(self, gradient_steps: int, batch_size: int) -> list[int]:
         """Gradient steps whose batches are drawn in one call, in turn."""

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from ..common.torch_helpers import usual_defaults
-from ..replay.following import check_size, end_running_episodes, follow_env
+from ..replay.following import end_running_episodes, follow_env
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
 
 
@@ -89,7 +89,6 @@ class WholeEpisodesDDPG(DDPG):
         buffer = self.replay_buffer
         if buffer is None or self.env is None:
             return
-        check_size(buffer, self.env)
         follow_env(buffer, self.env)
         buffer.device = self.device
         if buffer is not self._known_buffer:

@@ -1,1 +1,1 @@
-"""The three stages behind one `learn()` (Algorithm 1)."""
+"""The three stages behind one `learn()` (Algorithm 1), and the folder that they are saved in."""

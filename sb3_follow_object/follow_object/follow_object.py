@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import os
-import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..callbacks.curriculum_callback import CurriculumCallback
 from ..callbacks.fresh_episodes import FreshEpisodes, begin_new_episodes
 from ..callbacks.reach_callback import ReachCallback
-from ..common.array_trees import load_tree, save_tree
-from ..common.files import atomic_write
 from ..common.numbers import checked_whole
 from ..common.reports import Report
 from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
 from ..common.seeds import stream_seed
 from ..ddpg.actor_files import save_actor
 from ..ddpg.her_ddpg import HerDDPG
-from ..envs import IDS, make_vec
 from ..envs.goal_envs import known_id
 from ..imagination.curriculum import Curriculum
 from ..imagination.goal_predictor import GoalPredictor
@@ -41,6 +36,8 @@ from ..settings.presets import run_config
 from ..settings.run_config import check_plain
 from ..settings.stages import StageSettings
 from .checks import check_algorithms
+from .robot_env import robot_env
+from .saved_folder import Saved, read, write
 
 
 class FollowObject:
@@ -150,7 +147,7 @@ class FollowObject:
             self.report,
             needs_networks=reads_object_networks(self.settings["algorithm"]),
         )
-        self.env: VecEnv = self._robot_env("robot")
+        self.env: VecEnv = robot_env(self.settings, "robot")
         self.horizon = int(self.env.get_attr("spec", indices=[0])[0].max_episode_steps)
         self.curriculum = Curriculum(self.horizon, **self.settings["curriculum"])
         self._checked = False
@@ -237,7 +234,7 @@ class FollowObject:
         self.check()
         if self.imagine:
             predictor = self.predictor or self.object_stage.learn_predictor()
-            test_env = self._robot_env("test")
+            test_env = robot_env(self.settings, "test")
             self.env = ImaginedGoalVecEnv(self.env, predictor, self.curriculum)
             test_env = ImaginedGoalVecEnv(test_env, predictor, self.curriculum, mode="test")
             test_env.seed(stream_seed(self.seed, "test"))
@@ -289,15 +286,12 @@ class FollowObject:
             callbacks.append(FreshEpisodes(lambda n: stream_seed(self.seed, f"robot {n}")))
         own = (self.reach_callback, self.curriculum_callback)
         callbacks += [each for each in own if each is not None]
-        if isinstance(callback, list):
-            callbacks += callback
-        elif isinstance(callback, BaseCallback):
-            callbacks.append(callback)
-        elif callback is not None:
-            callbacks.append(ConvertCallback(callback))
+        for each in callback if isinstance(callback, list) else [callback]:
+            if each is not None:
+                callbacks.append(each if isinstance(each, BaseCallback) else ConvertCallback(each))
         model.learn(
             remaining,
-            callback=CallbackList(callbacks),
+            callback=callbacks,
             log_interval=log_interval,  # type: ignore[arg-type]
             reset_num_timesteps=False,
             progress_bar=progress_bar,
@@ -370,19 +364,9 @@ class FollowObject:
             ValueError: a setting is a Python object, which a save does not hold.
         """
         check_plain(self.settings, "save()")
-        settings = json.dumps({**self.settings, "env_id": self.full_id}, indent=2).encode()
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        if self.predictor is not None:
-            self.predictor.save(folder / "predictor")
-        elif (folder / "predictor").exists():
-            shutil.rmtree(folder / "predictor")
-        if self.object_stage.networks is not None:
-            self.object_stage.networks.save(folder / OBJECT_FILE)
-        else:
-            (folder / OBJECT_FILE).unlink(missing_ok=True)
-        save_tree(folder / "state.safetensors", self.state_dict(replay_buffer))
-        atomic_write(folder / "settings.json", settings)
+        settings = {**self.settings, "env_id": self.full_id}
+        stage, state = self.object_stage, self.state_dict(replay_buffer)
+        write(Path(folder), Saved(settings, stage.predictor, stage.networks, state))
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str], report: Report | None = None) -> FollowObject:
@@ -393,16 +377,14 @@ class FollowObject:
         """
         folder = Path(folder)
         try:
-            settings = json.loads((folder / "settings.json").read_text())
-            env_id = known_id(settings["env_id"])
-            predictor = None
-            if (folder / "predictor").exists():
-                predictor = GoalPredictor.load(folder / "predictor", env_id=env_id)
-            networks = None
-            if (folder / OBJECT_FILE).exists():
-                networks = ObjectNetworks.load(folder / OBJECT_FILE, env_id=env_id)
-            run = cls(**settings, predictor=predictor, object_networks=networks, report=report)
-            run.load_state_dict(load_tree(folder / "state.safetensors"))
+            saved = read(folder)
+            run = cls(
+                **saved.settings,
+                predictor=saved.predictor,
+                object_networks=saved.object_networks,
+                report=report,
+            )
+            run.load_state_dict(saved.state)
             return run
         except (OSError, KeyError, RecursionError, TypeError, ValueError) as error:
             raise ValueError(f"{folder} holds no saved FollowObject ({error})") from error
@@ -418,18 +400,6 @@ class FollowObject:
         self.env.close()
         if self.curriculum_callback is not None:
             self.curriculum_callback.test_env.close()
-
-    def _robot_env(self, purpose: str) -> VecEnv:
-        reward_type = self.settings["reward_type"]
-        # Environments of others need not know the word; theirs are sparse unless asked.
-        options = (
-            {}
-            if self.env_id not in IDS and reward_type == "sparse"
-            else {"reward_type": reward_type}
-        )
-        env = make_vec(self.env_id, self.settings["n_envs"], self.settings["n_threads"], **options)
-        env.seed(stream_seed(self.seed, purpose))
-        return env
 
 
 def _say_nothing(sentence: str) -> None:

@@ -1,1 +1,1 @@
-"""F_phi, the curriculum over its goals, and the wrappers that show them (section 4.2, 4.3)."""
+"""F_phi, the curriculum over its goals, and the wrappers that show them (sections 4.2 and 4.3)."""

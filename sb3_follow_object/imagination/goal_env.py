@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 from gymnasium import spaces
 
+from ..envs.goal_envs import missing_goal_keys
 from .curriculum import Curriculum
 from .goal_predictor import GoalPredictor
 from .predictor_files import POSITION
@@ -31,12 +32,11 @@ def check_horizons(predictor: GoalPredictor, curriculum: Curriculum) -> None:
 
 def checked_goals(space: spaces.Space, has: Callable[[str], bool]) -> np.dtype[Any]:
     """Refuse what cannot be wrapped; return the dtype of goals."""
-    keys = set(space.spaces) if isinstance(space, spaces.Dict) else set()
-    missing = {"observation", "achieved_goal", "desired_goal"} - keys
+    missing = missing_goal_keys(space)
     if missing:
         raise ValueError(
-            f"Imagined goals need an environment with Dict goal observations, "
-            f"this one lacks {sorted(missing)}."
+            "Imagined goals need an environment with Dict goal observations, "
+            f"this one lacks {missing}."
         )
     goals = cast(spaces.Dict, space)["desired_goal"]
     if goals.shape != (POSITION,) or goals.dtype is None:

@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from ..common.answers import check_shape, one_each
-from ..common.copies import WholeCopies
-from ..common.vec_env_copies import let_vec_envs_be_copied, reduce_vec_wrapper
+from ..common.vec_env_copies import CopyableVecEnvWrapper, let_vec_envs_be_copied
 from .curriculum import Curriculum
 from .goal_env import (
     STREAM,
@@ -37,7 +36,7 @@ MODES = ("train", "test")
 SHARED = ("predictor", "curriculum")  # what all copies of a vectorised environment share
 
 
-class ImaginedGoalVecEnv(WholeCopies, VecEnvWrapper):
+class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
     """Show imagined goals in a vectorised environment (paper, Algorithm 1).
 
     Observations, infos and the ends of episodes are those of ``ImaginedGoalWrapper``, and
@@ -178,9 +177,6 @@ class ImaginedGoalVecEnv(WholeCopies, VecEnvWrapper):
         self._rng.bit_generator.state = state["rng"]
         if "venv" in state:
             self.venv.set_state(state["venv"])  # type: ignore[attr-defined]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return reduce_vec_wrapper(self)
 
     def ahead(self, rows: np.ndarray, distance: float) -> np.ndarray:
         """Return where F_phi sees each episode's object after so much of its way, (m, 3) metres.

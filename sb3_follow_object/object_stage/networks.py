@@ -14,6 +14,7 @@ from torch import nn
 
 from ..common.array_trees import load_tree, save_tree
 from ..common.numbers import checked_whole
+from ..common.reports import reason
 from ..common.torch_helpers import WholeModule, lowest, usual_defaults
 from ..ddpg.her_ddpg import HerDDPG
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
@@ -243,8 +244,9 @@ class ObjectNetworks(WholeModule):
             if not all(bool(th.isfinite(value).all()) for value in networks.state_dict().values()):
                 raise ValueError("it holds NaN or infinity")
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())
-            raise ValueError(f"{path} does not hold an object's networks ({reason})") from error
+            raise ValueError(
+                f"{path} does not hold an object's networks ({reason(error)})"
+            ) from error
         networks.check(env_id, physics, f"the object's networks in {path}")
         return networks
 

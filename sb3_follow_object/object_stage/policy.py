@@ -1,4 +1,4 @@
-"""Stage one: the object learns to move by itself (section 3.1 of the paper)."""
+"""Stage one: the object learns to move by itself (section 4.1 of the paper)."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def keeps_object_on_table(env_id: str, setting: bool | None = None) -> bool:
 
 
 def collect_paths(model: Any, env: VecEnv, n_episodes: int) -> ObjectPaths:
-    """Roll the object policy out without noise (section 3.2 of the paper).
+    """Roll the object policy out without noise (section 4.2 of the paper).
 
     Args:
         model: anything with SB3's `predict`.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
 
+from ..envs.goal_envs import missing_goal_keys
 from ..settings.stages import ReachSettings
 from .actor import ReachActor
 
@@ -132,13 +133,12 @@ class Approach:
 
 def check_reachable(space: spaces.Space, settings: ReachSettings) -> None:
     """Raise a ValueError for an environment in which an effector cannot reach for an object."""
-    keys = getattr(space, "spaces", {})
-    missing = {"observation", "achieved_goal", "desired_goal"} - set(keys)
+    missing = missing_goal_keys(space)
     if missing:
         raise ValueError(
-            "Reaching first needs Dict goal observations; this environment lacks "
-            f"{sorted(missing)}."
+            f"Reaching first needs Dict goal observations; this environment lacks {missing}."
         )
+    keys = cast(spaces.Dict, space)
     if keys["achieved_goal"].shape != (3,):
         raise ValueError(
             "Reaching first needs goals that are object positions of shape (3,); this "

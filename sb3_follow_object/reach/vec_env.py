@@ -7,9 +7,10 @@ from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from ..common.vec_env_copies import CopyableVecEnvWrapper
 from ..imagination.vec_env import ImaginedGoalVecEnv
 from ..replay.episode_buffer import EXECUTED
 from ..settings.stages import ReachSettings
@@ -17,7 +18,7 @@ from .actor import ReachActor
 from .approach import AHEAD, STREAM, Approach, Observation, check_reachable
 
 
-class ReachFirstVecEnv(VecEnvWrapper):
+class ReachFirstVecEnv(CopyableVecEnvWrapper):
     """Let the effector reach for the object first in a share of the episodes.
 
     While it reaches, the actions given are replaced; infos carry "executed_action", which

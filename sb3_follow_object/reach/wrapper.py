@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..common.copies import WholeCopies
 from ..replay.episode_buffer import EXECUTED
 from ..settings.stages import ReachSettings
 from .actor import ReachActor
@@ -14,7 +15,9 @@ from .approach import AHEAD, STREAM, Approach, Observation, check_reachable
 
 
 class ReachFirstWrapper(
-    gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray], gym.utils.RecordConstructorArgs
+    WholeCopies,
+    gym.Wrapper[Observation, np.ndarray, Observation, np.ndarray],
+    gym.utils.RecordConstructorArgs,
 ):
     """Let the effector reach for the object first in a share of the episodes.
 

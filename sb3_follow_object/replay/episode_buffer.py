@@ -1,4 +1,4 @@
-"""Which episodes a replay buffer holds: when one begins, ends, counts and is overwritten."""
+"""Which episodes a replay buffer holds, from one's beginning to its loss, and draws steps of."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from ..envs.goal_envs import episode_steps
 from ..settings.sizes import check_buffer
 from .episode_table import EpisodeTable
-from .record_buffer import RecordReplayBuffer
+from .record_buffer import Gathered, RecordReplayBuffer
 from .steps import lost_steps
 
 GRAVITY = 9.81  # m/s^2
@@ -20,12 +21,14 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
     """RecordReplayBuffer that knows its finished episodes; `FollowObjectReplayBuffer` says more."""
 
     imagined_ratio: float
+    moved_ratio: float
     moved_distance: float
     moved_priority: str
     step_seconds: float
     min_goal_distance: float
     original_goals: np.ndarray
     _far: np.ndarray
+    rng: np.random.Generator
     table: EpisodeTable
     n_added: int
 
@@ -138,16 +141,49 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         gains = np.diff(energy, prepend=GRAVITY * origin[2])
         return float(np.clip(gains, 0.0, None).sum())
 
+    def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        row, step = self.table.draw(n, self.rng)
+        if self.moved_ratio > 0.0 and self.table.n_transitions(with_priority=True):
+            chosen = np.flatnonzero(self.rng.random(n) < self.moved_ratio)
+            row[chosen], step[chosen] = self.table.draw(len(chosen), self.rng, by_priority=True)
+        return row, step
+
+    def _flat(self, episode: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Indices slot * n_envs + environment (n,) of steps of episodes, facts (n, 4)."""
+        slot = episode[:, 0] + step
+        slot -= self.buffer_size * (slot >= self.buffer_size)
+        return slot * self.n_envs + episode[:, 1]
+
+    def sample_pairs(
+        self, n: int, rng: np.random.Generator
+    ) -> tuple[Gathered, Gathered, np.ndarray]:
+        """Draw stored transitions, each with a later one of its episode or itself.
+
+        Args:
+            n: how many.
+            rng: drawn from in place of the buffer's own generator.
+
+        Returns:
+            the transitions, the later ones, and how many steps later these are, (n,) int.
+        """
+        row, step = self.table.draw(n, rng)
+        episode = self.table.facts.take(row, axis=0)
+        later = rng.integers(episode[:, 2] - step)
+        first, then = (self._flat(episode, at) for at in (step, step + later))
+        return (
+            self._gather(first, self._achieved_goals(first)),
+            self._gather(then, self._achieved_goals(then)),
+            later,
+        )
+
     def check_size(self) -> None:
         """Raise a ValueError where the buffer cannot hold an episode of every environment.
 
         Not done as it is made: what is loaded only to act may have next to none.
         """
-        if self.env is None or not self.env.has_attr("spec"):
-            return
-        spec = self.env.get_attr("spec", indices=[0])[0]
-        if spec is not None and spec.max_episode_steps is not None:
-            check_buffer(self.buffer_size, self.n_envs, spec.max_episode_steps)
+        steps = None if self.env is None else episode_steps(self.env)
+        if steps is not None:
+            check_buffer(self.buffer_size, self.n_envs, steps)
 
     def is_ready(self) -> bool:
         """Whether an episode has ended, so that there is something to draw from."""

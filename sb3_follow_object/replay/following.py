@@ -9,23 +9,16 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from .her_replay_buffer import FollowObjectReplayBuffer
-
-
-def check_size(buffer: Any, env: VecEnv) -> None:
-    """Raise a ValueError for a replay buffer of another number of environments."""
-    if buffer.n_envs != env.num_envs:
-        raise ValueError(
-            f"the replay buffer holds steps of {buffer.n_envs} environments; "
-            f"the algorithm's has {env.num_envs} copies"
-        )
+from .steps import check_copies
 
 
 def follow_env(buffer: Any, env: VecEnv) -> None:
     """Let a hindsight buffer ask this environment; others ask none.
 
     Raises:
-        ValueError: it lacks what the buffer asks for.
+        ValueError: it has another number of copies, or lacks what the buffer asks for.
     """
+    check_copies(buffer.n_envs, env.num_envs)
     if not isinstance(buffer, HerReplayBuffer) or buffer.env is env:
         return
     if isinstance(buffer, FollowObjectReplayBuffer):

@@ -20,7 +20,8 @@ from ..settings.learning import ReplaySettings
 from .cher import GoalSelection
 from .episode_buffer import EpisodeReplayBuffer
 from .episode_table import EpisodeTable
-from .record_buffer import NEXT_DESIRED, Gathered
+from .record_buffer import NEXT_DESIRED
+from .steps import check_copies
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
 Strategy = GoalSelectionStrategy | str
@@ -165,11 +166,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
 
     def check_env(self, env: VecEnv) -> None:
         """Raise a ValueError for an environment that `set_env` refuses."""
-        if env.num_envs != self.n_envs:
-            raise ValueError(
-                f"the replay buffer holds steps of {self.n_envs} environments; this one has "
-                f"{env.num_envs} copies"
-            )
+        check_copies(self.n_envs, env.num_envs)
         if self.imagined_ratio > 0.0:
             imagination_of(env, IMAGINED_RATIO)
         asks = self.reward_function is None and self.her_ratio > 0.0
@@ -325,41 +322,6 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             rewards=self._to_tensor(rewards).reshape(-1, 1),
         )
         return samples, self._to_tensor(steps_to_goal).reshape(-1, 1)
-
-    def sample_pairs(
-        self, n: int, rng: np.random.Generator
-    ) -> tuple[Gathered, Gathered, np.ndarray]:
-        """Draw stored transitions, each with a later one of its episode or itself.
-
-        Args:
-            n: how many.
-            rng: drawn from in place of the buffer's own generator.
-
-        Returns:
-            the transitions, the later ones, and how many steps later these are, (n,) int.
-        """
-        row, step = self.table.draw(n, rng)
-        episode = self.table.facts.take(row, axis=0)
-        later = rng.integers(episode[:, 2] - step)
-        first, then = (self._flat(episode, at) for at in (step, step + later))
-        return (
-            self._gather(first, self._achieved_goals(first)),
-            self._gather(then, self._achieved_goals(then)),
-            later,
-        )
-
-    def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        row, step = self.table.draw(n, self.rng)
-        if self.moved_ratio > 0.0 and self.table.n_transitions(with_priority=True):
-            chosen = np.flatnonzero(self.rng.random(n) < self.moved_ratio)
-            row[chosen], step[chosen] = self.table.draw(len(chosen), self.rng, by_priority=True)
-        return row, step
-
-    def _flat(self, episode: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Indices slot * n_envs + environment (n,) of steps of episodes, facts (n, 4)."""
-        slot = episode[:, 0] + step
-        slot -= self.buffer_size * (slot >= self.buffer_size)
-        return slot * self.n_envs + episode[:, 1]
 
     def _to_tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(np.asarray(array, dtype=np.float32)).to(self.device)

@@ -8,6 +8,15 @@ from typing import Any
 import numpy as np
 
 
+def check_copies(n_envs: int, n_copies: int) -> None:
+    """Raise a ValueError unless a replay buffer has places for as many copies as there are."""
+    if n_envs != n_copies:
+        raise ValueError(
+            f"the replay buffer holds steps of {n_envs} environments; this one has {n_copies} "
+            "copies"
+        )
+
+
 def fitted(array: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     """Return an array in a shape that holds as many numbers: nothing is broadcast.
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from ..callbacks.eval_callback import OriginalGoalEvalCallback
 from ..common.copies import NoCopies
+from ..common.signals import stop_signals_to
 from ..follow_object.follow_object import FollowObject
 from .checkpoints import Checkpoints
 from .run_folder import BEST_POLICY, POLICY
@@ -32,7 +32,7 @@ class StopSignals(NoCopies):
 
     def __init__(self) -> None:
         self.requested = False
-        self._earlier: dict[int, Any] = {}
+        self._heeding = ExitStack()
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if a signal has come."""
@@ -40,18 +40,13 @@ class StopSignals(NoCopies):
             raise KeyboardInterrupt
 
     def __enter__(self) -> StopSignals:
-        if threading.current_thread() is not threading.main_thread():
-            return self
-        for sig in (signal.SIGINT, signal.SIGTERM):
-            self._earlier[sig] = signal.signal(sig, self._note)
+        self._heeding.enter_context(stop_signals_to(self._note))
         return self
 
     def __exit__(self, *raised: object) -> None:
-        for sig, handler in self._earlier.items():
-            # None stands for one that was not installed from Python, which has no other name.
-            signal.signal(sig, signal.SIG_DFL if handler is None else handler)
+        self._heeding.close()
 
-    def _note(self, signum: int, frame: Any) -> None:
+    def _note(self) -> None:
         self.check()
         self.requested = True
 

@@ -1,3 +1,5 @@
+"""Which level an episode plays, when k_max grows, and what is refused of either."""
+
 from __future__ import annotations
 
 import json

@@ -1,3 +1,5 @@
+"""F_phi: what it learns of paths, how it predicts, and its folder on the disk."""
+
 from __future__ import annotations
 
 import hashlib

@@ -17,6 +17,7 @@ from typing import Any
 
 import cloudpickle
 import copied_things
+import copies_elsewhere
 import numpy as np
 import pytest
 import toy
@@ -62,7 +63,7 @@ def test_a_copy_goes_on_as_the_original_and_neither_disturbs_the_other(name: str
 def verdicts(request: pytest.FixtureRequest) -> dict[str, str]:
     """How each thing compares with what another process has of it."""
     done = subprocess.run(
-        [sys.executable, copied_things.__file__, request.param],
+        [sys.executable, copies_elsewhere.__file__, request.param],
         env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / "tests" / "support")},
         capture_output=True,
         text=True,

@@ -155,7 +155,7 @@ def test_a_buffer_that_was_assigned_follows_too(tmp_path: Any) -> None:
     model.learn(2 * 2 * HORIZON, reset_num_timesteps=False)
     assert model.moments.count == pytest.approx(count + 2 * 2 * 2 * HORIZON)
     model.replay_buffer = make_buffer(make_env(3))
-    with pytest.raises(ValueError, match="holds steps of 3 environments; the algorithm's has 2"):
+    with pytest.raises(ValueError, match="holds steps of 3 environments; this one has 2"):
         model.learn(20)
 
 

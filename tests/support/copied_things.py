@@ -1,23 +1,10 @@
-"""What can be copied, how each is used, and processes in which copies of it are used.
-
-`python copied_things.py fork` (or spawn) uses each thing here and in another process and prints how
-the two compare, as JSON.
-"""
+"""What can be copied, and how each is used."""
 
 from __future__ import annotations
 
 import io
-import json
-import multiprocessing
-import os
-import pickle
-import select
-import signal
-import sys
-import tempfile
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -39,12 +26,13 @@ from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
+from sb3_follow_object.reach.vec_env import ReachFirstVecEnv
+from sb3_follow_object.reach.wrapper import ReachFirstWrapper
 from sb3_follow_object.replay.episode_table import EpisodeTable
 from sb3_follow_object.replay.records import Records
 
 ROBOT, OBJECT = "FollowObject/PnPSimpleV1-v0", "FollowObject/PnPSimpleV1Object-v0"
 PUSH = "FollowObject/PushSideGap-v0"
-LIMIT = 20  # seconds that a use may take before it counts as hanging
 
 Make = Callable[[], Any]
 Use = Callable[[Any], Any]
@@ -326,6 +314,14 @@ THINGS: dict[str, tuple[Make, Use]] = {
     "ImaginedGoalVecEnv, 2 threads": (lambda: begun_batch(imagined_batch(2)), play_batch),
     "VecMonitor": (lambda: begun_batch(VecMonitor(imagined_batch(2))), play_batch),
     "VecFrameStack": (lambda: begun_batch(VecFrameStack(imagined_batch(1), 2)), play_batch),
+    "ReachFirstWrapper": (
+        lambda: begun_single(ReachFirstWrapper(gym.make(ROBOT))),
+        play_single,
+    ),
+    "ReachFirstVecEnv": (
+        lambda: begun_batch(ReachFirstVecEnv(imagined_batch(2))),
+        play_batch,
+    ),
     "GoalPredictor": (fitted_predictor, use_predictor),
     "Curriculum": (lambda: toy.curriculum(k_max=3), use_curriculum),
     "FollowObjectReplayBuffer": (filled_buffer, use_buffer),
@@ -361,81 +357,3 @@ def seeded(use: Callable[..., Any], *arguments: Any) -> Any:
     np.random.seed(0)
     th.manual_seed(0)
     return use(*arguments)
-
-
-def equal(one: Any, other: Any) -> bool:
-    try:
-        np.testing.assert_equal(one, other)
-    except AssertionError:
-        return False
-    return True
-
-
-# Processes ------------------------------------------------------------------------------------
-
-
-def used_in_a_fork(thing: Any, use: Use) -> Any:
-    """What a forked child gets from using what it has of its parent's."""
-    reader, writer = os.pipe()
-    child = os.fork()
-    if child == 0:
-        try:
-            data = pickle.dumps(seeded(use, thing))
-        except BaseException as error:
-            data = pickle.dumps(f"{type(error).__name__}: {error}")
-        with os.fdopen(writer, "wb") as file:
-            file.write(data)
-        os._exit(0)
-    os.close(writer)
-    with os.fdopen(reader, "rb") as file:
-        answers, _, _ = select.select([file], [], [], LIMIT)
-        data = file.read() if answers else b""
-    if not data:
-        os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return pickle.loads(data) if data else "it hangs"
-
-
-def serve(connection: Any) -> None:
-    """Use what comes, in a spawned process, until nothing does."""
-    while (message := connection.recv()) is not None:
-        name, thing = message
-        try:
-            answer = pickle.dumps(seeded(THINGS[name][1], thing))
-        except BaseException as error:
-            answer = pickle.dumps(f"{type(error).__name__}: {error}")
-        connection.send_bytes(answer)
-
-
-def main(way: str) -> dict[str, str]:
-    """Compare each thing with what another process has of it."""
-    verdicts = {}
-    here, there = multiprocessing.get_context("spawn").Pipe()
-    if way == "spawn":
-        other = multiprocessing.get_context("spawn").Process(target=serve, args=(there,))
-        other.start()
-    for name, (make, use) in THINGS.items():
-        th.set_num_threads(2 if name == "GoalPredictor" else 1)
-        thing = seeded(make)
-        seeded(use, thing)  # whatever is made when it is first used, threads above all, is there
-        if way == "fork":
-            theirs = used_in_a_fork(thing, use)
-        else:
-            here.send((name, thing))
-            theirs = pickle.loads(here.recv_bytes()) if here.poll(LIMIT) else "it hangs"
-        ours = seeded(use, thing)
-        verdicts[name] = "equal" if equal(ours, theirs) else f"{theirs!s:.300}"
-    if way == "spawn":
-        here.send(None)
-        other.join(LIMIT)
-        other.kill()
-    return verdicts
-
-
-if __name__ == "__main__":
-    # The classes must have the names that the spawned process finds them under.
-    import copied_things
-
-    os.chdir(tempfile.mkdtemp())
-    Path("verdicts.json").write_text(json.dumps(copied_things.main(sys.argv[1])))
-    print(Path("verdicts.json").read_text())

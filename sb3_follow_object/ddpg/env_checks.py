@@ -1,0 +1,69 @@
+"""What an environment must be so that HerDDPG can learn in it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
+
+from ..envs.goal_envs import episode_steps, missing_goal_keys
+
+
+def check_goals(space: spaces.Space) -> None:
+    """Raise a ValueError for observations without goals."""
+    missing = missing_goal_keys(space)
+    if missing:
+        raise ValueError(
+            f"the environment's observations lack {', '.join(missing)}; HerDDPG needs "
+            "a goal environment with observation, achieved_goal and desired_goal"
+        )
+
+
+def check_wrappers(env: Any) -> None:
+    """Raise a ValueError for an environment in VecNormalize or VecFrameStack."""
+    if unwrap_vec_normalize(env) is not None:
+        raise ValueError(
+            "HerDDPG standardises its inputs itself and knows the range of its rewards; leave "
+            "VecNormalize (rl_zoo3's normalize) out"
+        )
+    if is_vecenv_wrapped(env, VecFrameStack):
+        raise ValueError(
+            "VecFrameStack (rl_zoo3's frame_stack) stacks goals too, for which the environment "
+            "has no reward; leave it out"
+        )
+
+
+def horizon_of(env: Any) -> int:
+    """Return T, steps of an episode.
+
+    Raises:
+        ValueError: the environment does not tell it.
+    """
+    steps = episode_steps(env)
+    if steps is None:
+        raise ValueError(
+            "the environment does not say how long its episodes are (spec.max_episode_steps); "
+            "give gamma and train_freq in steps"
+        )
+    return steps
+
+
+def check_rewards(rewards: th.Tensor, clipped_at_0: bool, hindsight_bound: bool) -> None:
+    """Raise a ValueError for rewards whose targets would be bounded wrongly.
+
+    Args:
+        rewards: of a batch.
+        clipped_at_0: whether targets are at most 0, as `target_clip` "auto" has them.
+        hindsight_bound: whether they are raised to what episodes of -1 a step prove.
+    """
+    if clipped_at_0 and float(rewards.max()) > 0.0:
+        raise ValueError(
+            f"a reward is {float(rewards.max()):g}; target_clip 'auto' is for none above "
+            "0: give (low, high), the bounds of the returns, or None"
+        )
+    if hindsight_bound and not bool(((rewards == 0.0) | (rewards == -1.0)).all()):
+        raise ValueError(
+            "hindsight_bound is for rewards of -1 and 0, and one is another; set it to false"
+        )

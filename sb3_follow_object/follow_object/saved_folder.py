@@ -1,0 +1,68 @@
+"""The folder of a saved `FollowObject`: settings, what the object stage learned, training state."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..common.array_trees import load_tree, save_tree
+from ..common.files import atomic_write
+from ..envs.goal_envs import known_id
+from ..imagination.goal_predictor import GoalPredictor
+from ..object_stage.networks import FILE as OBJECT_NETWORKS
+from ..object_stage.networks import ObjectNetworks
+
+_SETTINGS, _PREDICTOR, _STATE = "settings.json", "predictor", "state.safetensors"
+
+
+@dataclass
+class Saved:
+    """What the folder holds.
+
+    Attributes:
+        settings: arguments of `FollowObject` by name, plain values.
+        predictor: F_phi, if there is one.
+        object_networks: of the object stage, if they are needed.
+        state: `FollowObject.state_dict`.
+    """
+
+    settings: dict[str, Any]
+    predictor: GoalPredictor | None
+    object_networks: ObjectNetworks | None
+    state: dict[str, Any]
+
+
+def write(folder: Path, saved: Saved) -> None:
+    """Write a folder; files of an earlier save are replaced, or removed."""
+    settings = json.dumps(saved.settings, indent=2).encode()
+    folder.mkdir(parents=True, exist_ok=True)
+    if saved.predictor is not None:
+        saved.predictor.save(folder / _PREDICTOR)
+    elif (folder / _PREDICTOR).exists():
+        shutil.rmtree(folder / _PREDICTOR)
+    if saved.object_networks is not None:
+        saved.object_networks.save(folder / OBJECT_NETWORKS)
+    else:
+        (folder / OBJECT_NETWORKS).unlink(missing_ok=True)
+    save_tree(folder / _STATE, saved.state)
+    atomic_write(folder / _SETTINGS, settings)
+
+
+def read(folder: Path) -> Saved:
+    """Read what `write` wrote.
+
+    Raises:
+        OSError, KeyError, RecursionError, TypeError, ValueError: it holds no save, or a damaged
+            one.
+    """
+    settings = json.loads((folder / _SETTINGS).read_text())
+    env_id = known_id(settings["env_id"])
+    predictor = networks = None
+    if (folder / _PREDICTOR).exists():
+        predictor = GoalPredictor.load(folder / _PREDICTOR, env_id=env_id)
+    if (folder / OBJECT_NETWORKS).exists():
+        networks = ObjectNetworks.load(folder / OBJECT_NETWORKS, env_id=env_id)
+    return Saved(settings, predictor, networks, load_tree(folder / _STATE))
