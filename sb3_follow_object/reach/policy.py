@@ -20,7 +20,7 @@ from ..ddpg.auxiliary import AuxiliaryCritic, Transitions
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
 from ..ddpg.updates import Updates
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
-from ..settings.stages import ReachSettings
+from ..settings.stages import ReachFirstSettings
 from .actor import ReachActor
 from .approach import check_effector
 
@@ -28,6 +28,10 @@ _MIN_STD = 0.01  # floor of the inputs' standard deviations
 _HIDDEN = [128, 128]
 _TO_OBJECT = 0.2  # share of the goals at which the object stood
 _IDLE = 0.1  # standard deviation of an action's entry below which reaching does not need it
+
+
+def _learning_rate(progress: float) -> float:
+    return 1e-3
 
 
 class ReachPolicy:
@@ -56,7 +60,7 @@ class ReachPolicy:
         self,
         observation_space: spaces.Dict,
         action_space: spaces.Box,
-        settings: ReachSettings,
+        settings: ReachFirstSettings,
         seed: int = 0,
     ) -> None:
         self.effector = list(settings.effector)
@@ -70,11 +74,16 @@ class ReachPolicy:
         )
         with usual_defaults(), th.random.fork_rng(devices=[]):
             th.manual_seed(seed)
-            self.policy = HerPolicy(inputs, action_space, lambda progress: 1e-3, net_arch=_HIDDEN)
+            self.policy = HerPolicy(inputs, action_space, _learning_rate, net_arch=_HIDDEN)
         self.moments = RunningMeanStd(shape=(self.policy.actor.features_dim,))
         self.idle = np.zeros(action_space.shape, dtype=bool)
         self._n_updates = 0
         self._updates = Updates(self)
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether it has taken a gradient step."""
+        return self._n_updates > 0
 
     def learn(self, buffer: FollowObjectReplayBuffer, n_updates: int, batch_size: int) -> None:
         """Take gradient steps on what the robot did.

@@ -23,13 +23,14 @@ from .learning import (
     SldrSettings,
 )
 from .run_config import RunConfig
-from .stages import CurriculumSettings, StageSettings
+from .stages import CurriculumSettings, ReachSettings, StageSettings
 
 # Each with the dotted name that its settings stand under.
 GROUPS: dict[type[Group], str] = {
     RunConfig: "",
     StageSettings: "",
     CurriculumSettings: "curriculum.",
+    ReachSettings: "reach.",
     AlgorithmSettings: "",
     ReplaySettings: "replay_buffer_kwargs.",
     CherSettings: "replay_buffer_kwargs.cher.",
