@@ -54,7 +54,8 @@ class Approach:
         self._place = np.zeros((n_envs, 3))
         self._above = np.zeros(n_envs, dtype=bool)
         self._steps = np.zeros(n_envs, dtype=np.int64)
-        self._idle = np.zeros((n_envs, 1))  # what the entries do in the episode that are not needed
+        # What the entries of actions do that reaching does not need, drawn for an episode.
+        self._idle = np.zeros((n_envs, *action_space.shape))
         self.counts = np.zeros((2, 2), dtype=np.int64)
 
     def begin(self, rows: np.ndarray, obs: Observation, ahead: np.ndarray) -> None:
@@ -66,9 +67,8 @@ class Approach:
             ahead: where each object shall go next, (m, 3) metres.
         """
         chosen = self.rng.random(len(rows)) < self.share
-        idle = self.rng.uniform(-1.0, 1.0, len(rows))
+        self._idle[rows] = self.rng.uniform(-1.0, 1.0, self._idle[rows].shape)
         self.began[rows] = self.reaching[rows] = chosen & (self.actor is not None)
-        self._idle[rows, 0] = idle
         self._above[rows] = self.settings.height > 0.0
         self._steps[rows] = 0
         self.came[rows] = False
@@ -89,7 +89,8 @@ class Approach:
         actions = np.array(actions)
         place = self._target()[rows]
         chosen = self.actor(obs["observation"][rows].astype(np.float32), place.astype(np.float32))
-        chosen[:, self.actor.idle] = self._idle[rows]
+        idle = self.actor.idle
+        chosen[:, idle] = self._idle[rows][:, idle]
         chosen += self.rng.normal(0.0, self.settings.noise, chosen.shape)
         share = 0.5 * (np.clip(chosen, -1.0, 1.0) + 1.0)  # of the way from low to high
         actions[rows] = self._low + share * (self._high - self._low)
