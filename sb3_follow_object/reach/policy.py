@@ -15,6 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from torch import nn
 
+from ..common.copies import WholeCopies
 from ..common.torch_helpers import usual_defaults
 from ..ddpg.auxiliary import AuxiliaryCritic, Transitions
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
@@ -34,7 +35,7 @@ def _learning_rate(progress: float) -> float:
     return 1e-3
 
 
-class ReachPolicy:
+class ReachPolicy(WholeCopies):
     """DDPG + HER on the effector's position, from the robot's own replay buffer.
 
     Args:
