@@ -12,8 +12,8 @@ from ..common.torch_helpers import usable_device
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs import make_vec, object_id
 from ..reach.approach import BEHIND, check_reachable, reach_first_settings
-from ..settings.learning import PredictorSettings
 from ..settings.fields import settings_of
+from ..settings.learning import PredictorSettings
 from ..settings.sizes import check_stages
 from ..settings.stages import ReachFirstSettings, ReachTeachingSettings
 

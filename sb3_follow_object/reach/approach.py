@@ -39,9 +39,7 @@ class Approach:
             effector came to the place.
     """
 
-    def __init__(
-        self, n_envs: int, action_space: spaces.Box, settings: ReachFirstSettings
-    ) -> None:
+    def __init__(self, n_envs: int, action_space: spaces.Box, settings: ReachFirstSettings) -> None:
         self.settings = settings
         self.effector = list(settings.effector)
         self._low, self._high = action_space.low, action_space.high
@@ -162,7 +160,9 @@ def check_reachable(
 ) -> None:
     """Raise a ValueError for an environment in which an effector cannot reach for an object."""
     if not isinstance(actions, spaces.Box):
-        raise ValueError(f"Reaching first needs actions in a Box; this environment's are {actions}.")
+        raise ValueError(
+            f"Reaching first needs actions in a Box; this environment's are {actions}."
+        )
     keys = getattr(space, "spaces", {})
     missing = {"observation", "achieved_goal", "desired_goal"} - set(keys)
     if missing:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -190,7 +191,7 @@ def test_share_fades_as_the_learner_comes_there_by_itself() -> None:
     assert callback.success == pytest.approx(0.1 * 0.5 + 0.9 * 0.0 + 0.1 * (1.0 - 0.05))
     fading = reports(callback, *[(0, 8, 0, 8)] * 60)
     assert fading[0] == pytest.approx(0.45)
-    assert all(later <= sooner for sooner, later in zip(fading, fading[1:], strict=False))
+    assert all(later <= sooner for sooner, later in pairwise(fading))
     assert fading[-1] == 0.0 and min(share for share in fading if share) >= 0.02
     again = reports(callback, *[(8, 0, 0, 0)] * 5)
     assert again[-1] > 0.15, "a learner that no longer comes there is helped again"

@@ -165,7 +165,7 @@ def test_standoff_is_the_tasks_unless_it_is_given(
         (3, "reach must be a mapping, not 3"),
         ({"shares": 1}, "reach has no setting 'shares'; did you mean 'share'"),
         ({"share": 2}, r"share is 2; it must lie in \[0, 1\]"),
-        ({"standoff": "behind"}, "standoff must be \"auto\" or a number of at least 0"),
+        ({"standoff": "behind"}, 'standoff must be "auto" or a number of at least 0'),
     ],
 )
 def test_bad_settings_are_one_sentence(reach: Any, sentence: str) -> None:

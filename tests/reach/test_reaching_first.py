@@ -70,7 +70,7 @@ def test_effector_goes_above_the_object_and_then_down_to_it(face: str) -> None:
     objects = env.reset()["achieved_goal"].copy()
     env.seed(0)  # the same episode again
     way = effectors(env, HORIZON - 1)
-    above = objects + [0.0, 0.0, QUIET["height"]]
+    above = objects + np.array([0.0, 0.0, QUIET["height"]])
     to_above = np.linalg.norm(way - above, axis=2)
     to_object = np.linalg.norm(way - objects, axis=2)
     assert (to_above.min(axis=0) <= QUIET["tolerance"]).all()

@@ -221,17 +221,17 @@ def test_relay_her_without_reaching_is_her() -> None:
 
 
 def test_method_without_a_paper_preset_says_so() -> None:
-    with pytest.raises(ValueError, match="^'rher' has no preset 'paper', for the paper has no"):
+    with pytest.raises(ValueError, match=r"^'rher' has no preset 'paper', for the paper has no"):
         run_config(TASK, method="rher", preset="paper")
 
 
 @pytest.mark.parametrize(
     ("entry", "sentence"),
     [
-        ({"env_wrapper": [REACH_WRAPPER]}, "does nothing without the callback sb3_follow_object.R"),
-        ({"callback": [REACH_CALLBACK]}, "does nothing without the env_wrapper sb3_follow_object.R"),
-        (reaching({"share": 0.3}, {}), "ReachFirstWrapper has no setting 'share'; give it to Reach"),
-        (reaching({}, {"noise": 0.3}), "ReachCallback has no setting 'noise'; give it to ReachFirs"),
+        ({"env_wrapper": [REACH_WRAPPER]}, "does nothing without the callback sb3_"),
+        ({"callback": [REACH_CALLBACK]}, "does nothing without the env_wrapper "),
+        (reaching({"share": 0.3}, {}), "has no setting 'share'; give it to ReachCallback"),
+        (reaching({}, {"noise": 0.3}), "has no setting 'noise'; give it to ReachFirst"),
         (reaching({"hight": 0.3}, {}), "ReachFirstWrapper has no setting 'hight'; did you mean"),
         (reaching({}, {"share": 3}), "ReachCallback: share is 3; it must lie in [0, 1]"),
         (reaching([1], {}), "the arguments of sb3_follow_object.ReachFirstWrapper are not a mapp"),

@@ -24,9 +24,9 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 import toy
-from small_buffers import as_arrays, fill, make_buffer, make_env
 from reaching import REACH, StraightActor
 from reaching import TASK as REACH_TOY
+from small_buffers import as_arrays, fill, make_buffer, make_env
 from small_models import make_model, weights
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor
 from tiny import tiny_networks
