@@ -88,6 +88,7 @@ class ReachFirstVecEnv(WholeCopies, VecEnvWrapper):
     def reset(self) -> Observation:
         """Start an episode in every copy."""
         self._obs = cast(Observation, self.venv.reset())
+        self.reset_infos = self.venv.reset_infos
         rows = np.arange(self.num_envs)
         self.approach.begin(rows, self._obs, self._ahead(rows))
         return self._obs
