@@ -11,35 +11,52 @@ from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 from ..reach.policy import ReachPolicy
 from ..reach.vec_env import ReachFirstVecEnv
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
-from ..settings.stages import ReachSettings
+from ..settings.stages import ReachTeachingSettings, part_of_reach
 from .copyable import CopyableCallback
 
-_SMOOTHING = 0.1  # of a rollout's rate in the running ones
+_SMOOTHING = 0.1  # weight of a rollout's rate in the running ones
 _LEAST_SHARE = 0.02  # below it nobody reaches first any more
 
 
 class ReachCallback(CopyableCallback):
     """Teach the reach policy after each rollout and carry it into the environments.
 
-    The share of episodes that begin with reaching falls as the learner's own episodes come to the
-    place by themselves; once it is nothing the reach policy learns no more. Records reach/share,
-    reach/success (of episodes that begin with reaching) and reach/own_success (of all others).
+    Where the effector is and when it has arrived it takes from the environment's wrapper. A rollout
+    that ends no episode teaches nothing. The share of episodes that begin with reaching falls as
+    the learner's own episodes come to the place by themselves; while it is nothing the reach policy
+    learns no more. Records reach/share, reach/success (of episodes that begin with reaching) and
+    reach/own_success (of all others). It keeps what it has learned when another training begins.
 
     Args:
         seed: of the reach policy; None draws one from NumPy's global stream, which SB3 seeds.
-        settings: of `ReachSettings`, as the environment's wrapper has them.
+        settings: of `ReachTeachingSettings`.
+
+    Attributes:
+        policy: the reach policy, once training has started.
+        success: running share in [0, 1] of the episodes begun with reaching that come to the place.
+        own_success: the same of all others.
 
     Raises:
-        ValueError: training starts in an environment without ReachFirstVecEnv or
-            ReachFirstWrapper, or with another replay buffer than FollowObjectReplayBuffer.
+        ValueError: a setting that cannot be meant; or training starts in an environment without
+            ReachFirstVecEnv or ReachFirstWrapper, or with another replay buffer than
+            FollowObjectReplayBuffer.
     """
 
     def __init__(self, seed: int | None = None, **settings: Any) -> None:
         super().__init__()
-        self.settings = ReachSettings(**settings)
+        given = part_of_reach(ReachTeachingSettings, settings, type(self).__name__)
+        self.settings = ReachTeachingSettings(**given)
         self.seed = seed
         self.policy: ReachPolicy | None = None
         self.success = self.own_success = 0.0
+        self._episode_ended = False
+
+    @property
+    def share(self) -> float:
+        """Share of the episodes that begin with reaching now."""
+        learned = self.own_success if self.settings.fade else 0.0
+        share = self.settings.share * (1.0 - learned)
+        return share if share >= _LEAST_SHARE else 0.0
 
     def _on_training_start(self) -> None:
         if not self._is_wrapped():
@@ -53,46 +70,50 @@ class ReachCallback(CopyableCallback):
                 "ReachCallback learns from a FollowObjectReplayBuffer; the model has a "
                 f"{type(buffer).__name__}: give replay_buffer_class=FollowObjectReplayBuffer"
             )
-        if self._made_policy()._n_updates:
-            self._carry()
+        if self.policy is None:
+            self.policy = self._make_policy()
+        if self.policy.has_learned:
+            self._carry(self.policy)
 
     def _on_step(self) -> bool:
+        self._episode_ended |= bool(np.any(self.locals["dones"]))
         return True
 
     def _on_rollout_end(self) -> None:
-        buffer: Any = self.model.replay_buffer  # type: ignore[attr-defined]
-        self._count()
-        if buffer.is_ready() and self.share >= _LEAST_SHARE:
-            policy = self._made_policy()
-            policy.learn(buffer, self.settings.n_updates, self.settings.batch_size)
-        self._carry()
+        if self._episode_ended:
+            self._episode_ended = False
+            self._count()
+            self._teach()
         self.logger.record("reach/share", self.share)
         self.logger.record("reach/success", self.success)
         self.logger.record("reach/own_success", self.own_success)
 
-    @property
-    def share(self) -> float:
-        """Share of the episodes that begin with reaching now."""
-        share = self.settings.share * (1.0 - self.own_success * self.settings.fade)
-        return share if share >= _LEAST_SHARE else 0.0
-
-    def _made_policy(self) -> ReachPolicy:
-        if self.policy is None:
-            seed = int(np.random.randint(2**31 - 1000)) if self.seed is None else self.seed
-            space, actions = self.model.observation_space, self.model.action_space
-            assert isinstance(space, spaces.Dict) and isinstance(actions, spaces.Box)
-            self.policy = ReachPolicy(space, actions, self.settings, seed)
-        return self.policy
-
     def _count(self) -> None:
-        reached, came, own, came_by_itself = np.sum(self._ask("take_counts"), axis=0)
-        if reached:
-            self.success += _SMOOTHING * (came / reached - self.success)
-        if own:
-            self.own_success += _SMOOTHING * (came_by_itself / own - self.own_success)
+        """Bring the running rates up to the episodes that have ended."""
+        counts = np.sum(self._ask("take_counts"), axis=0)
+        (own_failed, own_came), (failed, came) = counts.tolist()
+        if failed + came:
+            self.success += _SMOOTHING * (came / (failed + came) - self.success)
+        if own_failed + own_came:
+            rate = own_came / (own_failed + own_came)
+            self.own_success += _SMOOTHING * (rate - self.own_success)
 
-    def _carry(self) -> None:
-        self._ask("set_reach", self._made_policy().actor(), self.share)
+    def _teach(self) -> None:
+        assert self.policy is not None
+        buffer: Any = self.model.replay_buffer  # type: ignore[attr-defined]
+        if self.share and buffer.is_ready():
+            self.policy.learn(buffer, self.settings.n_updates, self.settings.batch_size)
+        if self.policy.has_learned:
+            self._carry(self.policy)
+
+    def _carry(self, policy: ReachPolicy) -> None:
+        self._ask("set_reach", policy.actor(), self.share)
+
+    def _make_policy(self) -> ReachPolicy:
+        seed = int(np.random.randint(2**31 - 1000)) if self.seed is None else self.seed
+        space, actions = self.model.observation_space, self.model.action_space
+        assert isinstance(space, spaces.Dict) and isinstance(actions, spaces.Box)
+        return ReachPolicy(space, actions, self._ask("reach_settings")[0], seed)
 
     def _is_wrapped(self) -> bool:
         wrapped = unwrap_vec_wrapper(self.training_env, ReachFirstVecEnv)
@@ -111,11 +132,14 @@ class ReachCallback(CopyableCallback):
             "policy": None if self.policy is None else self.policy.state_dict(),
             "success": float(self.success),
             "own_success": float(self.own_success),
+            "episode_ended": self._episode_ended,
         }
 
     def load_state_dict(self, state: dict[str, Any], model: Any) -> None:
         """Continue from ``state_dict``; `model` is the one that will be trained."""
         self.success, self.own_success = float(state["success"]), float(state["own_success"])
+        self._episode_ended = bool(state["episode_ended"])
         if state["policy"] is not None:
             self.model = model
-            self._made_policy().load_state_dict(state["policy"])
+            self.policy = self._make_policy()
+            self.policy.load_state_dict(state["policy"])

@@ -11,8 +11,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from ..common.torch_helpers import usable_device
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs import make_vec, object_id
+from ..reach.approach import BEHIND, check_reachable, reach_first_settings
+from ..settings.fields import settings_of
 from ..settings.learning import PredictorSettings
 from ..settings.sizes import check_stages
+from ..settings.stages import ReachFirstSettings, ReachTeachingSettings
 
 
 def check_algorithms(
@@ -31,6 +34,9 @@ def check_algorithms(
     """
     check_stages(settings["env_id"], settings, horizon)
     usable_device(settings["predictor_fit"].get("device", PredictorSettings.device))
+    if settings.get("reach") is not None:
+        reach = reach_first_settings(reach_parts(settings)[0], "reach", None)
+        check_reachable(env.observation_space, env.action_space, reach)
     arguments = copy.deepcopy(settings["algorithm"])  # SB3 writes into policy_kwargs
     # What these two need is not there yet; their settings have been checked.
     if needs_networks:
@@ -42,6 +48,23 @@ def check_algorithms(
         object_env = make_vec(object_id(settings["env_id"]), 1)
         _check_algorithm(object_env, horizon, copy.deepcopy(settings["object_algorithm"]))
         object_env.close()
+
+
+def reach_parts(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the settings of reaching first, those of its wrapper and those of its callback.
+
+    Args:
+        settings: `FollowObject`'s.
+    """
+    reach = settings["reach"]
+    # Where objects are kept on the table for the sake of pushing, the standoff is that of pushing.
+    if settings["object_on_table"] and reach.get("standoff", "auto") == "auto":
+        reach = {**reach, "standoff": BEHIND}
+    first, teaching = (
+        {name: value for name, value in reach.items() if name in settings_of(part)}
+        for part in (ReachFirstSettings, ReachTeachingSettings)
+    )
+    return first, teaching
 
 
 def _check_algorithm(env: VecEnv, horizon: int, arguments: dict[str, Any]) -> None:

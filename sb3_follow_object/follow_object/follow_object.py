@@ -35,7 +35,7 @@ from ..settings.fields import checked
 from ..settings.presets import run_config
 from ..settings.run_config import check_plain
 from ..settings.stages import StageSettings
-from .checks import check_algorithms
+from .checks import check_algorithms, reach_parts
 from .robot_env import robot_env
 from .saved_folder import Saved, read, write
 
@@ -57,7 +57,8 @@ class FollowObject:
         n_threads: of the simulation; by default as many as there are cores.
         reward_type: "sparse" (paper) or "dense".
         algorithm: keyword arguments of the robot's `HerDDPG`.
-        reach: settings of reaching first, {} for their defaults; by default nothing reaches first.
+        reach: of `ReachSettings`: a learned policy takes the effector to the object at the
+            beginning of a share of the training episodes. {} takes the defaults; None, none does.
         curriculum: keyword arguments of `Curriculum` besides the horizon.
         object_algorithm: keyword arguments of the object's `HerDDPG`.
         object_on_table: whether the object may not leave the table in the first stage; by default
@@ -244,10 +245,10 @@ class FollowObject:
                 every=self.settings["test_every"],
                 store=self.settings["store_tests"],
             )
-        reach = self.settings.get("reach")
-        if reach is not None:
-            self.env = ReachFirstVecEnv(self.env, **reach)
-            self.reach_callback = ReachCallback(stream_seed(self.seed, "reach"), **reach)
+        if self.settings.get("reach") is not None:
+            first, teaching = reach_parts(self.settings)
+            self.env = ReachFirstVecEnv(self.env, **first)
+            self.reach_callback = ReachCallback(stream_seed(self.seed, "reach"), **teaching)
         arguments: dict[str, Any] = {"policy": "MultiInputPolicy", **self.settings["algorithm"]}
         stage = self.object_stage
         if stage.needs_networks:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 
+from ..envs import IDS
 from ..envs.goal_envs import missing_goal_keys
-from ..settings.stages import ReachSettings
+from ..settings.stages import ReachFirstSettings, part_of_reach
 from .actor import ReachActor
 
 Observation = dict[str, np.ndarray]
 STREAM = 0x5EAC  # parts the reaching's random numbers from those of the environment's own seed
 AHEAD = 0.1  # metres of the object's way, whose end says where it shall go next
+BEHIND = 0.06  # metres, the standoff where objects are pushed
 
 
 class Approach:
@@ -26,17 +30,21 @@ class Approach:
 
     Args:
         n_envs: copies.
-        settings: how reaching is done.
+        action_space: of each copy.
+        settings: how reaching is done, the standoff in metres.
 
     Attributes:
         actor: what reaches; until there is one nothing does.
         share: of the episodes that begin with reaching; may be set at any time.
+        counts: episodes that have ended, (2, 2): whether they began with reaching, and whether the
+            effector came to the place.
     """
 
-    def __init__(self, n_envs: int, settings: ReachSettings) -> None:
+    def __init__(self, n_envs: int, action_space: spaces.Box, settings: ReachFirstSettings) -> None:
         self.settings = settings
         self.effector = list(settings.effector)
-        self.share = settings.share
+        self._low, self._high = action_space.low, action_space.high
+        self.share = 0.0
         self.actor: ReachActor | None = None
         self.rng = np.random.default_rng()
         self.reaching = np.zeros(n_envs, dtype=bool)
@@ -45,10 +53,9 @@ class Approach:
         self._place = np.zeros((n_envs, 3))
         self._above = np.zeros(n_envs, dtype=bool)
         self._steps = np.zeros(n_envs, dtype=np.int64)
-        self._idle = np.zeros((n_envs, 1))
-        # Episodes that ended since `take_counts`: begun with reaching, those of them that came to
-        # the place; others, and those of them that came.
-        self.counts = np.zeros(4, dtype=np.int64)
+        # What the entries of actions do that reaching does not need, drawn for an episode.
+        self._idle = np.zeros((n_envs, *action_space.shape))
+        self.counts = np.zeros((2, 2), dtype=np.int64)
 
     def begin(self, rows: np.ndarray, obs: Observation, ahead: np.ndarray) -> None:
         """Start episodes.
@@ -59,9 +66,8 @@ class Approach:
             ahead: where each object shall go next, (m, 3) metres.
         """
         chosen = self.rng.random(len(rows)) < self.share
-        idle = self.rng.uniform(-1.0, 1.0, len(rows))
+        self._idle[rows] = self.rng.uniform(-1.0, 1.0, self._idle[rows].shape)
         self.began[rows] = self.reaching[rows] = chosen & (self.actor is not None)
-        self._idle[rows, 0] = idle
         self._above[rows] = self.settings.height > 0.0
         self._steps[rows] = 0
         self.came[rows] = False
@@ -74,7 +80,7 @@ class Approach:
         self._place[rows] = place
 
     def act(self, obs: Observation, actions: np.ndarray) -> np.ndarray:
-        """Return the actions (n, action_dim) in [-1, 1] that are executed in place of others."""
+        """Return what is executed in place of the actions given, both (n, action_dim)."""
         rows = np.flatnonzero(self.reaching)
         if not rows.size:
             return actions
@@ -82,9 +88,11 @@ class Approach:
         actions = np.array(actions)
         place = self._target()[rows]
         chosen = self.actor(obs["observation"][rows].astype(np.float32), place.astype(np.float32))
-        chosen[:, self.actor.idle] = self._idle[rows]
+        idle = self.actor.idle
+        chosen[:, idle] = self._idle[rows][:, idle]
         chosen += self.rng.normal(0.0, self.settings.noise, chosen.shape)
-        actions[rows] = np.clip(chosen, -1.0, 1.0)
+        share = 0.5 * (np.clip(chosen, -1.0, 1.0) + 1.0)  # of the way from low to high
+        actions[rows] = self._low + share * (self._high - self._low)
         return actions
 
     def arrive(self, obs: Observation, dones: np.ndarray) -> None:
@@ -97,10 +105,7 @@ class Approach:
         arrived = near & ~self._above
         self._above &= ~near
         self.reaching &= ~arrived & (self._steps < self.settings.max_steps)
-        self.counts[0] += (dones & self.began).sum()
-        self.counts[1] += (dones & self.began & self.came).sum()
-        self.counts[2] += (dones & ~self.began).sum()
-        self.counts[3] += (dones & ~self.began & self.came).sum()
+        np.add.at(self.counts, (self.began[dones].astype(int), self.came[dones].astype(int)), 1)
 
     def _target(self) -> np.ndarray:
         target = self._place.copy()
@@ -108,8 +113,8 @@ class Approach:
         return target
 
     def take_counts(self) -> np.ndarray:
-        """Return what `counts` has had since the last call."""
-        counts, self.counts = self.counts, np.zeros(4, dtype=np.int64)
+        """Return `counts` since the last call."""
+        counts, self.counts = self.counts, np.zeros((2, 2), dtype=np.int64)
         return counts
 
     _ARRAYS = ("reaching", "began", "came", "_place", "_above", "_steps", "_idle", "counts")
@@ -131,8 +136,34 @@ class Approach:
             setattr(self, name, np.asarray(state[name]).astype(current.dtype))
 
 
-def check_reachable(space: spaces.Space, settings: ReachSettings) -> None:
+def reach_first_settings(
+    given: dict[str, Any], who: str, spec: EnvSpec | None
+) -> ReachFirstSettings:
+    """Return a wrapper's settings, the standoff in metres.
+
+    Args:
+        given: to the wrapper, by their names.
+        who: beginning of the sentence about what cannot be meant.
+        spec: of the environment, which says whether its objects are pushed; None says no.
+
+    Raises:
+        ValueError: a setting that cannot be meant.
+    """
+    settings = ReachFirstSettings(**part_of_reach(ReachFirstSettings, given, who))
+    if settings.standoff != "auto":
+        return settings
+    pushed = spec is not None and spec.id in IDS and IDS[spec.id][0].blocked_gripper
+    return replace(settings, standoff=BEHIND if pushed else 0.0)
+
+
+def check_reachable(
+    space: spaces.Space, actions: spaces.Space, settings: ReachFirstSettings
+) -> None:
     """Raise a ValueError for an environment in which an effector cannot reach for an object."""
+    if not isinstance(actions, spaces.Box):
+        raise ValueError(
+            f"Reaching first needs actions in a Box; this environment's are {actions}."
+        )
     missing = missing_goal_keys(space)
     if missing:
         raise ValueError(

@@ -15,12 +15,13 @@ from gymnasium import spaces
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from torch import nn
 
+from ..common.copies import WholeCopies
 from ..common.torch_helpers import usual_defaults
 from ..ddpg.auxiliary import AuxiliaryCritic, Transitions
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
 from ..ddpg.updates import Updates
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
-from ..settings.stages import ReachSettings
+from ..settings.stages import ReachFirstSettings
 from .actor import ReachActor
 from .approach import check_effector
 
@@ -30,7 +31,11 @@ _TO_OBJECT = 0.2  # share of the goals at which the object stood
 _IDLE = 0.1  # standard deviation of an action's entry below which reaching does not need it
 
 
-class ReachPolicy:
+def _learning_rate(progress: float) -> float:
+    return 1e-3
+
+
+class ReachPolicy(WholeCopies):
     """DDPG + HER on the effector's position, from the robot's own replay buffer.
 
     Args:
@@ -56,7 +61,7 @@ class ReachPolicy:
         self,
         observation_space: spaces.Dict,
         action_space: spaces.Box,
-        settings: ReachSettings,
+        settings: ReachFirstSettings,
         seed: int = 0,
     ) -> None:
         self.effector = list(settings.effector)
@@ -70,11 +75,16 @@ class ReachPolicy:
         )
         with usual_defaults(), th.random.fork_rng(devices=[]):
             th.manual_seed(seed)
-            self.policy = HerPolicy(inputs, action_space, lambda progress: 1e-3, net_arch=_HIDDEN)
+            self.policy = HerPolicy(inputs, action_space, _learning_rate, net_arch=_HIDDEN)
         self.moments = RunningMeanStd(shape=(self.policy.actor.features_dim,))
         self.idle = np.zeros(action_space.shape, dtype=bool)
         self._n_updates = 0
         self._updates = Updates(self)
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether it has taken a gradient step."""
+        return self._n_updates > 0
 
     def learn(self, buffer: FollowObjectReplayBuffer, n_updates: int, batch_size: int) -> None:
         """Take gradient steps on what the robot did.

@@ -7,38 +7,59 @@ from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecNormalize,
+    is_vecenv_wrapped,
+    unwrap_vec_wrapper,
+)
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from ..common.vec_env_copies import CopyableVecEnvWrapper
 from ..imagination.vec_env import ImaginedGoalVecEnv
 from ..replay.episode_buffer import EXECUTED
-from ..settings.stages import ReachSettings
+from ..settings.stages import ReachFirstSettings
 from .actor import ReachActor
-from .approach import AHEAD, STREAM, Approach, Observation, check_reachable
+from .approach import (
+    AHEAD,
+    STREAM,
+    Approach,
+    Observation,
+    check_reachable,
+    reach_first_settings,
+)
 
 
 class ReachFirstVecEnv(CopyableVecEnvWrapper):
     """Let the effector reach for the object first in a share of the episodes.
 
     While it reaches, the actions given are replaced; infos carry "executed_action", which
-    `FollowObjectReplayBuffer` stores. Put it outside of ImaginedGoalVecEnv and inside VecMonitor.
+    `FollowObjectReplayBuffer` stores. Put it outside of ImaginedGoalVecEnv and inside VecMonitor
+    and VecNormalize.
 
     Args:
         venv: vectorised environment with Dict goal observations.
-        settings: of `ReachSettings`.
+        settings: of `ReachFirstSettings`; the standoff "auto" is that of a task of this package.
 
     Raises:
-        ValueError: the observations do not hold the effector where the settings say.
+        ValueError: a setting that cannot be meant, or the observations do not hold the effector
+            where the settings say, in metres.
     """
 
     def __init__(self, venv: VecEnv, **settings: Any) -> None:
         super().__init__(venv)
-        reach = ReachSettings(**settings)
-        check_reachable(venv.observation_space, reach)
-        self.approach = Approach(venv.num_envs, reach)
+        spec = venv.get_attr("spec", indices=[0])[0] if venv.has_attr("spec") else None
+        reach = reach_first_settings(settings, type(self).__name__, spec)
+        check_reachable(venv.observation_space, venv.action_space, reach)
+        if is_vecenv_wrapped(venv, VecNormalize):
+            raise ValueError(
+                "ReachFirstVecEnv needs observations in metres: put it inside VecNormalize, not "
+                "around it"
+            )
+        actions = cast(spaces.Box, venv.action_space)
+        self.approach = Approach(venv.num_envs, actions, reach)
         self._obs: Observation = {}
-        self._executed = np.zeros((venv.num_envs, *cast(spaces.Box, venv.action_space).shape))
+        self._executed = np.zeros((venv.num_envs, *actions.shape))
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the environments and the reaching; takes effect at the next reset."""
@@ -47,8 +68,12 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
         self.approach.rng = np.random.default_rng(None if first is None else [first, STREAM])
         return seeds
 
+    def reach_settings(self) -> ReachFirstSettings:
+        """Return how it reaches."""
+        return self.approach.settings
+
     def take_counts(self) -> np.ndarray:
-        """Return what `Approach.counts` has had since the last call, (4,) int."""
+        """Return `Approach.counts` since the last call, (2, 2) int."""
         return self.approach.take_counts()
 
     def set_reach(self, actor: ReachActor, share: float) -> None:
@@ -59,6 +84,7 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
     def reset(self) -> Observation:
         """Start an episode in every copy."""
         self._obs = cast(Observation, self.venv.reset())
+        self.reset_infos = self.venv.reset_infos
         rows = np.arange(self.num_envs)
         self.approach.begin(rows, self._obs, self._ahead(rows))
         return self._obs
@@ -82,19 +108,21 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
         infos = [
             {**info, EXECUTED: action} for info, action in zip(infos, self._executed, strict=True)
         ]
+        self._obs = obs
         ended = np.flatnonzero(dones)
         if ended.size:
             self.approach.begin(ended, obs, self._ahead(ended))
-        self._obs = obs
         return obs, rewards, dones, infos
 
     def get_state(self) -> dict[str, Any] | None:
         """Return the reaching's state and the inner one, None where that cannot be told."""
         if not hasattr(self.venv, "get_state"):
             return None
-        state = {"approach": self.approach.state_dict(), "venv": self.venv.get_state()}
-        state["obs"] = self._obs
-        return state
+        return {
+            "approach": self.approach.state_dict(),
+            "venv": self.venv.get_state(),
+            "obs": self._obs,
+        }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Continue from `get_state`."""
@@ -104,6 +132,10 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
 
     def _ahead(self, rows: np.ndarray) -> np.ndarray:
         """Return where each object shall go next, (m, 3): along F_phi's path, else its goal."""
-        if not isinstance(self.venv, ImaginedGoalVecEnv) or not self.approach.settings.standoff:
-            return self._obs["desired_goal"][rows]
-        return self.venv.ahead(rows, AHEAD)
+        if self.approach.settings.standoff:
+            imagined = unwrap_vec_wrapper(self.venv, ImaginedGoalVecEnv)
+            if imagined is not None:
+                return imagined.ahead(rows, AHEAD)
+            if self.venv.has_attr("ahead"):  # each copy has an ImaginedGoalWrapper
+                return np.array(self.venv.env_method("ahead", AHEAD, indices=rows))
+        return self._obs["desired_goal"][rows]

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
 from ..common.copies import WholeCopies
 from ..replay.episode_buffer import EXECUTED
-from ..settings.stages import ReachSettings
+from ..settings.stages import ReachFirstSettings
 from .actor import ReachActor
-from .approach import AHEAD, STREAM, Approach, Observation, check_reachable
+from .approach import (
+    AHEAD,
+    STREAM,
+    Approach,
+    Observation,
+    check_reachable,
+    reach_first_settings,
+)
 
 
 class ReachFirstWrapper(
@@ -28,18 +36,19 @@ class ReachFirstWrapper(
 
     Args:
         env: environment with Dict goal observations.
-        settings: of `ReachSettings`.
+        settings: of `ReachFirstSettings`; the standoff "auto" is that of a task of this package.
 
     Raises:
-        ValueError: the observations do not hold the effector where the settings say.
+        ValueError: a setting that cannot be meant, or the observations do not hold the effector
+            where the settings say.
     """
 
     def __init__(self, env: gym.Env, **settings: Any) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, **settings)
         super().__init__(env)
-        reach = ReachSettings(**settings)
-        check_reachable(env.observation_space, reach)
-        self.approach = Approach(1, reach)
+        reach = reach_first_settings(settings, type(self).__name__, env.spec)
+        check_reachable(env.observation_space, env.action_space, reach)
+        self.approach = Approach(1, cast(spaces.Box, env.action_space), reach)
         self._obs: Observation = {}
 
     def set_reach(self, actor: ReachActor, share: float) -> None:
@@ -47,8 +56,12 @@ class ReachFirstWrapper(
         self.approach.actor = actor
         self.approach.share = share
 
+    def reach_settings(self) -> ReachFirstSettings:
+        """Return how it reaches."""
+        return self.approach.settings
+
     def take_counts(self) -> np.ndarray:
-        """Return what `Approach.counts` has had since the last call, (4,) int."""
+        """Return `Approach.counts` since the last call, (2, 2) int."""
         return self.approach.take_counts()
 
     def reset(

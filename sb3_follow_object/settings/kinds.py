@@ -87,6 +87,15 @@ def _indices(value: Any) -> tuple[int, ...]:
     return numbers
 
 
+def _standoff(value: Any) -> Any:
+    if isinstance(value, str) and value == "auto":
+        return "auto"
+    metres = as_number(value)
+    if not 0.0 <= metres < math.inf:
+        raise ValueError
+    return metres
+
+
 def _policy(value: Any) -> Any:
     if isinstance(value, type) or value == "MultiInputPolicy":
         return value
@@ -114,6 +123,7 @@ TargetClip = Annotated[
 Rate = Annotated[Any, BeforeValidator(_rate), Said("a number in (0, inf)")]
 Strategy = Annotated[Any, BeforeValidator(_strategy), Said("'future', 'final' or 'episode'")]
 Indices = Annotated[Any, BeforeValidator(_indices), Said("three whole numbers of at least 0")]
+Standoff = Annotated[Any, BeforeValidator(_standoff), Said('"auto" or a number of at least 0')]
 Policy = Annotated[Any, BeforeValidator(_policy), Said("MultiInputPolicy")]
 PythonClass = Annotated[type, Said("a class, which only Python code can give")]
 Reward = Annotated[Any, Said("rnd, sldr or a subclass of `AuxiliaryReward`")]

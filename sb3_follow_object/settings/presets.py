@@ -18,18 +18,23 @@ from ..envs.task_table import BUILT_IN
 from .fields import Group, Setting, check_names, settings_of
 from .learning import AlgorithmSettings, check_auxiliary
 from .methods import METHODS as METHODS
+from .methods import WITHOUT_PAPER
 from .run_config import CONFIG, RunConfig
 from .sizes import check_sizes
-from .stages import StageSettings
+from .stages import ReachFirstSettings, ReachTeachingSettings, StageSettings, part_of_reach
 
 PRESETS = ("default", "paper")
 
 WRAPPER = "sb3_follow_object.ImaginedGoalWrapper"
 CALLBACK = "sb3_follow_object.CurriculumCallback"
+REACH_WRAPPER = "sb3_follow_object.ReachFirstWrapper"
+REACH_CALLBACK = "sb3_follow_object.ReachCallback"
+_KNOWN = {"env_wrapper": (WRAPPER, REACH_WRAPPER), "callback": (CALLBACK, REACH_CALLBACK)}
 # What makes an entry this or that method.
 _MARKS = (
     f"fo has env_wrapper {WRAPPER}, shaped reward_type dense, cher a setting "
-    "replay_buffer_kwargs.cher, and the auxiliary reward gives its name"
+    "replay_buffer_kwargs.cher, the auxiliary reward gives its name, and rher has none of these "
+    "but settings of reach"
 )
 # The callback's keyword arguments, and what FollowObject calls them.
 _CALLBACK_NAMES = {"every": "test_every", "n_episodes": "n_test_episodes", "store": "store_tests"}
@@ -72,6 +77,11 @@ def run_config(
     env_id = name if name in IDS else env_id
     if file is None:
         method = method or "fo"
+        if method in WITHOUT_PAPER and preset == "paper":
+            raise ValueError(
+                f"{method!r} has no preset 'paper', for the paper has no such rival; leave the "
+                "preset out"
+            )
         path = preset_file(method, preset)
     else:
         path = Path(file)
@@ -124,7 +134,11 @@ def run_config(
 
 
 def method_of(settings: Mapping[str, Any], imagine: bool) -> str:
-    """Return the name of the method that settings describe: its marks joined, "her" with none."""
+    """Return the name of the method that settings describe: its marks joined.
+
+    Without any it is "her" or, where something reaches first, "rher": what another method begins
+    its episodes with does not make it another one.
+    """
     auxiliary = _auxiliary_name(settings)
     marks = {
         "fo": imagine,
@@ -132,7 +146,8 @@ def method_of(settings: Mapping[str, Any], imagine: bool) -> str:
         auxiliary: bool(auxiliary),
         "cher": (settings.get("replay_buffer_kwargs") or {}).get("cher") is not None,
     }
-    return "-".join(name for name, marked in marks.items() if marked) or "her"
+    alone = "her" if settings.get("reach") is None else "rher"
+    return "-".join(name for name, marked in marks.items() if marked) or alone
 
 
 def _auxiliary_name(settings: Mapping[str, Any]) -> str:
@@ -223,10 +238,9 @@ def _named(entry: dict[str, Any], key: str, path: Path) -> dict[str, dict[str, A
             named[item] = {}
         else:
             raise ValueError(f"{path}: {key} must list class names with arguments, not {item!r}")
-    known = {"env_wrapper": WRAPPER, "callback": CALLBACK}[key]
     for name, arguments in named.items():
-        if name != known:
-            raise ValueError(f"{path}: {key} can hold {known} here, not {name!r}")
+        if name not in _KNOWN[key]:
+            raise ValueError(f"{path}: {key} can hold {' and '.join(_KNOWN[key])}, not {name!r}")
         if not isinstance(arguments, dict):
             raise ValueError(f"{path}: the arguments of {name} are not a mapping")
     return named
@@ -235,14 +249,20 @@ def _named(entry: dict[str, Any], key: str, path: Path) -> dict[str, dict[str, A
 def _flattened(entry: dict[str, Any], path: Path) -> dict[str, Any]:
     """Return an entry with the arguments of its wrapper, callback and environments as settings."""
     settings = _plain(entry)
-    for arguments in _named(settings, "env_wrapper", path).values():
+    wrappers = _named(settings, "env_wrapper", path)
+    callbacks = _named(settings, "callback", path)
+    if WRAPPER in wrappers:
+        arguments = wrappers[WRAPPER]
         check_names(arguments, ("predictor", "curriculum"), f"{path}: {WRAPPER}")
         if arguments.get("predictor", "auto") != "auto":
             raise ValueError(f"{path}: a run makes its own predictor; leave it out or say auto")
         settings["curriculum"] = arguments.get("curriculum") or {}
-    for arguments in _named(settings, "callback", path).values():
+    if CALLBACK in callbacks:
+        arguments = callbacks[CALLBACK]
         check_names(arguments, _CALLBACK_NAMES, f"{path}: {CALLBACK}")
         settings |= {_CALLBACK_NAMES[name]: value for name, value in arguments.items()}
+    reach = _reach(wrappers.get(REACH_WRAPPER), callbacks.get(REACH_CALLBACK), path)
+    settings |= {} if reach is None else {"reach": reach}
     env_kwargs = settings.get("env_kwargs") or {}
     check_names(env_kwargs, ("reward_type",), f"{path}: env_kwargs")
     settings |= env_kwargs
@@ -250,6 +270,23 @@ def _flattened(entry: dict[str, Any], path: Path) -> dict[str, Any]:
         name: value
         for name, value in settings.items()
         if name not in ("env_wrapper", "callback", "env_kwargs")
+    }
+
+
+def _reach(
+    first: dict[str, Any] | None, teaching: dict[str, Any] | None, path: Path
+) -> dict[str, Any] | None:
+    """Return the setting `reach` from the arguments of its wrapper and of its callback."""
+    if first is None and teaching is None:
+        return None
+    if first is None or teaching is None:
+        given, missing = REACH_CALLBACK, f"the env_wrapper {REACH_WRAPPER}"
+        if teaching is None:
+            given, missing = REACH_WRAPPER, f"the callback {REACH_CALLBACK}"
+        raise ValueError(f"{path}: {given} does nothing without {missing}; give both or neither")
+    return {
+        **part_of_reach(ReachTeachingSettings, teaching, f"{path}: {REACH_CALLBACK}"),
+        **part_of_reach(ReachFirstSettings, first, f"{path}: {REACH_WRAPPER}"),
     }
 
 

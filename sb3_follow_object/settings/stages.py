@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from .fields import Flag, Group, Number, Whole, setting
-from .kinds import Indices
+from .fields import Flag, Group, Number, Whole, checked, setting, settings_of
+from .kinds import Indices, Standoff
 from .learning import AlgorithmSettings, InverseSettings, PredictorSettings
 
 COPIES, THREADS = 4096, 1024  # what is more would fill the memory
@@ -54,17 +55,10 @@ class CurriculumTestSettings(Group):
 
 
 @dataclass(frozen=True)
-class ReachSettings(Group):
+class ReachFirstSettings(Group):
     """How the effector reaches for the object before the learner acts."""
 
-    title = "`reach`, of `ReachFirstVecEnv` and `ReachCallback`"
-    where = "reach"
-    share: Annotated[
-        Number, setting("of the episodes that begin with reaching at first", ge=0, le=1)
-    ] = 0.5
-    fade: Annotated[
-        Flag, setting("whether the share falls as the learner comes to the object by itself")
-    ] = True
+    where, whose = "reach", "ReachFirstWrapper"
     effector: Annotated[Indices, setting("where the observation holds the effector's position")] = (
         0,
         1,
@@ -77,16 +71,62 @@ class ReachSettings(Group):
         Number, setting("above the place that it is taken to first", unit="metres", ge=0)
     ] = 0.1
     standoff: Annotated[
-        Number, setting("of the place behind the object, as its way goes", unit="metres", ge=0)
-    ] = 0.0
+        Standoff,
+        setting(
+            "of the place behind the object, as its way goes; `auto`, 0.06 where it is pushed over "
+            "the table, else 0",
+            unit="metres",
+        ),
+    ] = "auto"
     noise: Annotated[
         Number, setting("standard deviation on each action while it reaches", ge=0)
     ] = 0.1
     max_steps: Annotated[Whole, setting("after which the learner acts all the same", ge=1)] = 25
+
+
+@dataclass(frozen=True)
+class ReachTeachingSettings(Group):
+    """How reaching is learned, and how many episodes begin with it."""
+
+    where, whose = "reach", "ReachCallback"
+    share: Annotated[
+        Number, setting("of the episodes that begin with reaching at first", ge=0, le=1)
+    ] = 0.5
+    fade: Annotated[
+        Flag, setting("whether the share falls as the learner comes to the object by itself")
+    ] = True
     n_updates: Annotated[
         Whole, setting("gradient steps of the reach policy after a rollout", ge=1)
     ] = 40
     batch_size: Annotated[Whole, setting("transitions of each of them", ge=1, le=10**6)] = 256
+
+
+@dataclass(frozen=True)
+class ReachSettings(ReachFirstSettings, ReachTeachingSettings):
+    """Both together, as `FollowObject` takes them."""
+
+    title = "`reach`, the first four of `ReachCallback`, the others of `ReachFirstWrapper`"
+
+
+def part_of_reach(
+    part: type[ReachFirstSettings] | type[ReachTeachingSettings], given: Mapping[str, Any], who: str
+) -> dict[str, Any]:
+    """Return the settings of reaching first that its wrapper or its callback is given.
+
+    Args:
+        part: whose settings they are.
+        given: by their names.
+        who: beginning of the sentence about what cannot be meant.
+
+    Raises:
+        ValueError: an unknown name, one that is the other's to have, or a value that cannot be
+            meant.
+    """
+    other = ReachTeachingSettings if part is ReachFirstSettings else ReachFirstSettings
+    for name in settings_of(other):
+        if name in given:
+            raise ValueError(f"{who} has no setting {name!r}; give it to {other.whose}")
+    return checked(part, given, who)
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ WAYS: dict[str, Callable[[Any], Any]] = {
 }
 # Python's copy of a wrapper or a tuple is one around the same things.
 SHALLOW = ("wrapped FetchEnv", "DummyVecEnv", "VecMonitor", "VecFrameStack")
-SHALLOW += ("CurriculumCallback", "OriginalGoalEvalCallback", "FollowObject")
+SHALLOW += ("CurriculumCallback", "OriginalGoalEvalCallback", "ReachCallback", "FollowObject")
 
 
 @pytest.mark.parametrize("name", THINGS)

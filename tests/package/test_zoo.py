@@ -81,7 +81,7 @@ def test_stock_ddpg_trains_and_plays(n_envs: int, cache: Path, tmp_path: Path) -
         assert "Success rate:" in play(tmp_path, "rl_zoo3.enjoy", *stock)
 
 
-@pytest.mark.parametrize(("method", "n_envs"), [("fo", 2), ("her", 1), ("sldr", 1)])
+@pytest.mark.parametrize(("method", "n_envs"), [("fo", 2), ("her", 1), ("sldr", 1), ("rher", 2)])
 def test_her_ddpg_trains_and_plays(method: str, n_envs: int, cache: Path, tmp_path: Path) -> None:
     steps = one_test("fo.yml", n_envs) if method == "fo" else 4 * HORIZON
     file = [] if method == "fo" else ["--conf-file", str(CONFIGS / f"{method}.yml")]
@@ -90,9 +90,26 @@ def test_her_ddpg_trains_and_plays(method: str, n_envs: int, cache: Path, tmp_pa
     assert ("k_max" in out) == ("test_success" in out) == (method == "fo")
     assert "moved_share" in out  # only HerDDPG logs it
     assert ("sldr/" in out) == (method == "sldr")
+    assert ("reach/" in out) == (method == "rher")
     check_run(tmp_path / "logs" / "her_ddpg" / "FollowObject-PushSideGap-v0_1", n_envs)
     if method != "her":
         assert "Success rate:" in play(tmp_path, f"{module} enjoy")
+
+
+@pytest.mark.parametrize("algorithm", ["ddpg", "tqc"])
+def test_stock_algorithms_reach_first(algorithm: str, cache: Path, tmp_path: Path) -> None:
+    entry = yaml.safe_load((CONFIGS / "ddpg.yml").read_text())["default"]
+    entry["env_wrapper"].append({"sb3_follow_object.ReachFirstWrapper": {"height": 0.05}})
+    teaching = {"share": 1.0, "n_updates": 2, "batch_size": 16}
+    entry["callback"].insert(0, {"sb3_follow_object.ReachCallback": teaching})
+    (tmp_path / "reach.yml").write_text(yaml.safe_dump({TASK: entry}))
+    stock = ["--algo", algorithm, *STOCK, "--conf-file", "reach.yml"]
+    steps = one_test("ddpg.yml", 2)
+    out = train(tmp_path, cache, "rl_zoo3.train", *stock, n_envs=2, steps=steps)
+    for name in ("share", "own_success", "k_max", "test_success"):
+        assert name in out
+    check_run(tmp_path / "logs" / algorithm / "FollowObject-PushSideGap-v0_1", 2)
+    assert "Success rate:" in play(tmp_path, "rl_zoo3.enjoy", *stock[:4])
 
 
 def test_ddpg_file_has_every_task_with_its_horizon() -> None:

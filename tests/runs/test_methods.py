@@ -56,6 +56,7 @@ LOGGED = {
     "cher": {"cher/proximity_weight"},
     "sldr": {"sldr/reward", "sldr/q_mean", "sldr/critic_loss"},
     "fo-sldr": {"sldr/reward", "curriculum/k_max"},
+    "rher": {"reach/share", "reach/success", "reach/own_success"},
 }
 # The object's 800 end with their second rollout, before any test; F_phi needs 8 paths of T steps.
 OBJECT_STEPS = {"sldr": 800, "fo-sldr": 800 + 8 * 50}

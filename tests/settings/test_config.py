@@ -15,10 +15,12 @@ import yaml
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import IDS
 from sb3_follow_object.runs.run_folder import difference
-from sb3_follow_object.settings.methods import METHODS
+from sb3_follow_object.settings.methods import METHODS, WITHOUT_PAPER
 from sb3_follow_object.settings.presets import (
     CALLBACK,
     PRESETS,
+    REACH_CALLBACK,
+    REACH_WRAPPER,
     WRAPPER,
     load_config,
     parse_override,
@@ -28,7 +30,8 @@ from sb3_follow_object.settings.presets import (
 
 TASK = "FollowObject/PushSideGap-v0"
 ROBOTS = [env_id for env_id, (_, alone) in IDS.items() if not alone]
-FILES = [preset_file(method, preset) for method in METHODS for preset in PRESETS]
+PAIRS = [(m, p) for m in METHODS for p in PRESETS if p != "paper" or m not in WITHOUT_PAPER]
+FILES = [preset_file(*pair) for pair in PAIRS]
 
 
 def write(path: Path, entry: dict[str, Any], env_id: str = TASK) -> Path:
@@ -40,8 +43,7 @@ def imagining(**curriculum: Any) -> dict[str, Any]:
     return {"env_wrapper": [{WRAPPER: {"predictor": "auto", "curriculum": curriculum}}]}
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("method", "preset"), PAIRS)
 @pytest.mark.parametrize("env_id", ROBOTS)
 def test_every_task_has_settings_in_every_preset(env_id: str, method: str, preset: str) -> None:
     config = run_config(env_id, method=method, preset=preset, seed=3)
@@ -95,6 +97,7 @@ OWN = {
     "sldr": {"auxiliary", *OBJECT_STAGE},
     "fo-sldr": {"auxiliary"},
     "cher": {"replay_buffer_kwargs.cher"},
+    "rher": {"reach", "learning_starts"},
 }
 
 
@@ -107,8 +110,7 @@ def leaves(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("method", OWN)
+@pytest.mark.parametrize(("method", "preset"), [pair for pair in PAIRS if pair[0] in OWN])
 @pytest.mark.parametrize("env_id", ROBOTS)
 def test_methods_differ_by_what_makes_them_alone(env_id: str, method: str, preset: str) -> None:
     base = "fo" if "fo" in method.split("-") else "her"
@@ -125,6 +127,7 @@ def test_methods_differ_by_what_makes_them_alone(env_id: str, method: str, prese
     if "sldr" in method:
         fo = run_config(env_id, method="fo", preset=preset).settings
         assert all(ours.settings.get(name) == fo.get(name) for name in OBJECT_STAGE)
+    assert ("reach" in ours.settings) == (method == "rher")
     mine, others = leaves(ours.settings), leaves(theirs.settings)
     differing = {n for n in {**mine, **others} if mine.get(n) != others.get(n)}
     own = OWN[method]
@@ -149,6 +152,9 @@ def test_distances_fit_between_the_bounds_of_shaped_targets() -> None:
         ({"replay_buffer_kwargs.cher": {}}, "cher"),
         ({"auxiliary.name": "sldr"}, "sldr"),
         ({"replay_buffer_kwargs.cher.picks": 9, "auxiliary.name": "rnd"}, "rnd-cher"),
+        ({"reach": {}}, "rher"),
+        ({"reach.share": 0.3}, "rher"),
+        ({"reach.share": 0.3, "auxiliary.name": "rnd"}, "rnd"),
     ],
 )
 def test_method_is_what_the_settings_make_it(
@@ -179,6 +185,65 @@ def test_wrapper_and_callback_become_settings(tmp_path: Path) -> None:
         "n_envs": 4,
         "algorithm": {"batch_size": 64, "train_freq": (2, "episode")},
     }
+
+
+def reaching(first: Any, teaching: Any) -> dict[str, Any]:
+    return {"env_wrapper": [{REACH_WRAPPER: first}], "callback": [{REACH_CALLBACK: teaching}]}
+
+
+def test_reaching_first_becomes_one_setting_of_its_wrapper_and_its_callback(tmp_path: Path) -> None:
+    entry = reaching({"standoff": 0.05, "effector": [3, 4, 5]}, {"share": "3e-1", "fade": False})
+    file = write(tmp_path / "my.yml", entry)
+    expected = {"standoff": 0.05, "effector": (3, 4, 5), "share": 0.3, "fade": False}
+    assert run_config(TASK, file=file).settings == {"imagine": False, "reach": expected}
+    both = imagining(p=0.5)
+    both["env_wrapper"].append(REACH_WRAPPER)
+    both["callback"] = [REACH_CALLBACK, {CALLBACK: {"every": 3}}]
+    config = run_config(TASK, file=write(tmp_path / "both.yml", both))
+    assert config.method == "fo", "what begins its episodes makes it no other method"
+    assert config.settings["reach"] == {} and config.settings["test_every"] == 3
+
+
+@pytest.mark.parametrize("method", ["fo", "shaped", "rnd", "sldr", "cher", "fo-sldr"])
+def test_reaching_first_is_switched_on_and_off_for_any_method(method: str) -> None:
+    plain = run_config(TASK, method=method, overrides={"reach": None})
+    assert plain.settings.get("reach") is None
+    for value, expected in (({}, {}), ({"share": 0.3}, {"share": 0.3})):
+        config = run_config(TASK, method=method, overrides={"reach": value})
+        assert (config.method, config.settings["reach"]) == (method, expected)
+    one = run_config(TASK, method=method, overrides={"reach.share": 0.3})
+    assert one.settings["reach"] == {"share": 0.3}
+
+
+def test_relay_her_without_reaching_is_her() -> None:
+    with pytest.raises(ValueError, match="with method 'her' after --set, not 'rher'"):
+        run_config(TASK, method="rher", overrides={"reach": None})
+
+
+def test_method_without_a_paper_preset_says_so() -> None:
+    with pytest.raises(ValueError, match=r"^'rher' has no preset 'paper', for the paper has no"):
+        run_config(TASK, method="rher", preset="paper")
+
+
+@pytest.mark.parametrize(
+    ("entry", "sentence"),
+    [
+        ({"env_wrapper": [REACH_WRAPPER]}, "does nothing without the callback sb3_"),
+        ({"callback": [REACH_CALLBACK]}, "does nothing without the env_wrapper "),
+        (reaching({"share": 0.3}, {}), "has no setting 'share'; give it to ReachCallback"),
+        (reaching({}, {"noise": 0.3}), "has no setting 'noise'; give it to ReachFirst"),
+        (reaching({"hight": 0.3}, {}), "ReachFirstWrapper has no setting 'hight'; did you mean"),
+        (reaching({}, {"share": 3}), "ReachCallback: share is 3; it must lie in [0, 1]"),
+        (reaching([1], {}), "the arguments of sb3_follow_object.ReachFirstWrapper are not a mapp"),
+    ],
+)
+def test_reaching_first_that_cannot_be_meant_is_refused(
+    tmp_path: Path, entry: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ValueError) as refusal:
+        run_config(TASK, file=write(tmp_path / "my.yml", entry))
+    assert sentence in str(refusal.value)
+    assert "\n" not in str(refusal.value)
 
 
 def test_file_without_imagined_goals_is_her(tmp_path: Path) -> None:

@@ -11,6 +11,8 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 import toy
+from reaching import REACH, StraightActor
+from reaching import TASK as REACH_TOY
 from small_buffers import as_arrays, fill, make_buffer, make_env
 from small_models import make_model, weights
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor
@@ -18,6 +20,7 @@ from tiny import tiny_networks
 
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
 from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
+from sb3_follow_object.callbacks.reach_callback import ReachCallback
 from sb3_follow_object.common.array_trees import Camera
 from sb3_follow_object.ddpg.auxiliary import Transitions
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
@@ -26,6 +29,8 @@ from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
+from sb3_follow_object.reach.actor import ReachActor
+from sb3_follow_object.reach.policy import ReachPolicy
 from sb3_follow_object.reach.vec_env import ReachFirstVecEnv
 from sb3_follow_object.reach.wrapper import ReachFirstWrapper
 from sb3_follow_object.replay.episode_table import EpisodeTable
@@ -212,6 +217,54 @@ def use_imagining_model(pair: tuple[HerDDPG, CurriculumCallback]) -> Any:
     ]
 
 
+def reaching_single() -> gym.Env:
+    env = ReachFirstWrapper(gym.make(REACH_TOY), **REACH)
+    env.set_reach(StraightActor(), 0.7)
+    return env
+
+
+def reaching_batch() -> ReachFirstVecEnv:
+    env = ReachFirstVecEnv(imagined_batch(1))
+    env.set_reach(StraightActor(), 0.7)
+    return env
+
+
+def reaching_model() -> tuple[HerDDPG, Any]:
+    """A model that trains where something reaches first, and the callback that teaches it."""
+    env = ReachFirstVecEnv(DummyVecEnv([lambda: gym.make(REACH_TOY)] * 2), **REACH)
+    tiny = {"train_freq": 20, "batch_size": 16, "gradient_steps": 2, "buffer_size": 800}
+    model = HerDDPG("MultiInputPolicy", env, **tiny, policy_kwargs={"net_arch": [16]}, seed=0)
+    callback = ReachCallback(seed=0, share=0.7, n_updates=2, batch_size=16)
+    model.learn(80, callback, log_interval=None)  # type: ignore[arg-type]
+    return model, callback
+
+
+def use_reaching_model(pair: tuple[HerDDPG, ReachCallback]) -> Any:
+    model, callback = pair
+    model.learn(80, callback, log_interval=None, reset_num_timesteps=False)  # type: ignore[arg-type]
+    assert callback.policy is not None
+    return [weights(model).numpy().copy(), use_reach_policy(callback.policy)]
+
+
+def taught_reach_policy() -> ReachPolicy:
+    policy = reaching_model()[1].policy
+    assert policy is not None
+    return policy
+
+
+def use_reach_policy(policy: ReachPolicy) -> Any:
+    env = DummyVecEnv([lambda: gym.make(REACH_TOY)] * 2)
+    env.seed(0)
+    buffer = make_buffer(env, 200)
+    fill([buffer], env, 40)
+    policy.learn(buffer, 2, 16)
+    return [policy.moments.mean.copy(), use_reach_actor(policy.actor())]
+
+
+def use_reach_actor(actor: ReachActor) -> Any:
+    return [actor(np.full((2, 6), 0.3, np.float32), np.full((2, 3), 0.2, np.float32)), actor.idle]
+
+
 def evaluated_model() -> tuple[HerDDPG, Any]:
     model = trained()
     eval_env = DummyVecEnv([toy.PointEnv] * 2)
@@ -314,14 +367,11 @@ THINGS: dict[str, tuple[Make, Use]] = {
     "ImaginedGoalVecEnv, 2 threads": (lambda: begun_batch(imagined_batch(2)), play_batch),
     "VecMonitor": (lambda: begun_batch(VecMonitor(imagined_batch(2))), play_batch),
     "VecFrameStack": (lambda: begun_batch(VecFrameStack(imagined_batch(1), 2)), play_batch),
-    "ReachFirstWrapper": (
-        lambda: begun_single(ReachFirstWrapper(gym.make(ROBOT))),
-        play_single,
-    ),
-    "ReachFirstVecEnv": (
-        lambda: begun_batch(ReachFirstVecEnv(imagined_batch(2))),
-        play_batch,
-    ),
+    "ReachFirstWrapper": (lambda: begun_single(reaching_single()), play_single),
+    "ReachFirstVecEnv": (lambda: begun_batch(reaching_batch()), play_batch),
+    "ReachPolicy": (taught_reach_policy, use_reach_policy),
+    "ReachActor": (lambda: taught_reach_policy().actor(), use_reach_actor),
+    "ReachCallback": (reaching_model, use_reaching_model),
     "GoalPredictor": (fitted_predictor, use_predictor),
     "Curriculum": (lambda: toy.curriculum(k_max=3), use_curriculum),
     "FollowObjectReplayBuffer": (filled_buffer, use_buffer),

@@ -36,7 +36,7 @@ def fill(buffers: list[Any], env: Any, n_steps: int, seed: int = 0) -> None:
     rng = np.random.default_rng(seed)
     obs = env.reset()
     for _ in range(n_steps):
-        actions = rng.uniform(-1, 1, (env.num_envs, 3)).astype(np.float32)
+        actions = rng.uniform(-1, 1, (env.num_envs, *env.action_space.shape)).astype(np.float32)
         new_obs, rewards, dones, infos = env.step(actions)
         next_obs = with_terminal_observations(new_obs, dones, infos)
         for buffer in buffers:
