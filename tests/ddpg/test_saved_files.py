@@ -20,63 +20,65 @@ from sb3_follow_object.ddpg.actor_files import save_actor
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.ddpg.policies import HerPolicy
 
+pytestmark = pytest.mark.xdist_group("saved files")  # the tests share one process
+
 SEEN = {key: np.full((5, 3), 0.1) for key in ("observation", "achieved_goal", "desired_goal")}
 LOADER = """
 import sys
 sys.path.insert(0, {support!r})
 import numpy as np
 from sb3_follow_object import HerDDPG, HerPolicy, load_actor
-from stable_baselines3.common.save_util import load_from_pkl
 import toy
 seen = {{k: np.full((5, 3), 0.1) for k in ("observation", "achieved_goal", "desired_goal")}}
 env = toy.PointEnv()
-loaded = {loaded}
-np.save({out!r}, loaded.predict(seen, deterministic=True)[0])
+np.savez({out!r}, *[loaded.predict(seen, deterministic=True)[0] for loaded in [{loaded}]])
 """
-
-
-def elsewhere(loaded: str, out: Path) -> np.ndarray:
-    """Actions of what another process loads."""
-    script = LOADER.format(support=str(ROOT / "tests" / "support"), loaded=loaded, out=str(out))
-    run([sys.executable, "-c", script])
-    return np.load(out)
-
-
 LOADS = {
     "model": "HerDDPG.load({path!r})",
     "model on another device": "HerDDPG.load({path!r}, device='cpu')",
     "policy": "HerPolicy.load({path!r})",
     "actor": "load_actor({path!r}, env.observation_space, env.action_space)[0]",
 }
+MODELS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "with everything": {
+        "auxiliary": {"name": "rnd", "hidden": [8], "n_outputs": 4},
+        "average_decay": 0.9,
+        "policy_kwargs": {"critic_layer_norm": True, "features_clip": 2.0, "net_arch": [16]},
+    },
+}
+ALL = [(which, kind) for which in MODELS for kind in LOADS]
 
 
-@pytest.mark.parametrize("kind", LOADS)
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {
-            "auxiliary": {"name": "rnd", "hidden": [8], "n_outputs": 4},
-            "average_decay": 0.9,
-            "policy_kwargs": {"critic_layer_norm": True, "features_clip": 2.0, "net_arch": [16]},
-        },
-    ],
-    ids=["plain", "with everything"],
-)
+@pytest.fixture(scope="module")
+def actions(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], list[np.ndarray]]:
+    """What each model does, and what each thing saved of it does in one other process."""
+    folder = tmp_path_factory.mktemp("saved")
+    here, loads = [], []
+    for number, (which, kind) in enumerate(ALL):
+        model = make_model(**MODELS[which])
+        model.learn(200, log_interval=None)  # type: ignore[arg-type]
+        path = folder / f"{number}.zip"
+        if kind == "policy":
+            model.policy.save(str(path))
+        elif kind == "actor":
+            save_actor(path, model.policy.actor_average, "Point-v0")
+        else:
+            model.save(path)
+        here.append(model.predict(SEEN, deterministic=True)[0])  # type: ignore[arg-type]
+        loads.append(LOADS[kind].format(path=str(path)))
+    support, out = str(ROOT / "tests" / "support"), folder / "actions.npz"
+    script = LOADER.format(support=support, loaded=", ".join(loads), out=str(out))
+    run([sys.executable, "-c", script])
+    there = np.load(out)
+    return {case: [here[i], there[f"arr_{i}"]] for i, case in enumerate(ALL)}
+
+
+@pytest.mark.parametrize("case", ALL, ids=" ".join)
 def test_acts_the_same_in_another_process(
-    kind: str, options: dict[str, Any], tmp_path: Path
+    case: tuple[str, str], actions: dict[tuple[str, str], list[np.ndarray]]
 ) -> None:
-    model = make_model(**options)
-    model.learn(200, log_interval=None)  # type: ignore[arg-type]
-    path = tmp_path / "saved.zip"
-    if kind == "policy":
-        model.policy.save(str(path))
-    elif kind == "actor":
-        save_actor(path, model.policy.actor_average, "Point-v0")
-    else:
-        model.save(path)
-    got = elsewhere(LOADS[kind].format(path=str(path)), tmp_path / "actions.npy")
-    np.testing.assert_array_equal(got, model.predict(SEEN, deterministic=True)[0])  # type: ignore[arg-type]
+    np.testing.assert_array_equal(*actions[case])
 
 
 def test_a_policy_is_loaded_whole(tmp_path: Path) -> None:
