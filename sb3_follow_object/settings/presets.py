@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .. import zoo_configs
 from ..common.plain_yaml import load_yaml
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, object_id
 from ..envs.goal_envs import check_task
 from ..envs.registration import import_task
 from ..envs.task_table import BUILT_IN
+from ..zoo_configs import FOLDER
 from .fields import Group, Setting, check_names, settings_of
 from .learning import AlgorithmSettings, check_auxiliary
 from .methods import METHODS as METHODS
@@ -46,7 +46,7 @@ _GROUPS: tuple[type[Group], ...] = (RunConfig, StageSettings, AlgorithmSettings)
 def preset_file(method: str, preset: str = "default") -> Path:
     """Return the YAML file of a method that comes with the package."""
     name = method if preset == "default" else f"{method}-{preset}"
-    return Path(str(zoo_configs.__file__)).with_name(f"{name}.yml")
+    return FOLDER / f"{name}.yml"
 
 
 def run_config(
