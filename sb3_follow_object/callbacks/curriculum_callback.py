@@ -185,13 +185,13 @@ class CurriculumCallback(CopyableCallback):
         # A rollout's end may lie beyond the last step; schedules end at 0.
         model._current_progress_remaining = max(0.0, model._current_progress_remaining)
         self.logger.record("curriculum/test_success", episodes.success_rate)
-        if self.curriculum.report(episodes.success_rate):
-            self._share_curriculum()
-            if self.verbose:
-                print(
-                    f"k_max {self.curriculum.k_max} of {self.curriculum.n_levels} "
-                    f"after {self.num_timesteps} steps"
-                )
+        passed = self.curriculum.report(episodes.success_rate, len(episodes.success))
+        self._share_curriculum()
+        if passed and self.verbose:
+            print(
+                f"k_max {self.curriculum.k_max} of {self.curriculum.n_levels} "
+                f"after {self.num_timesteps} steps"
+            )
 
     def _share_curriculum(self) -> None:
         """Tell the model and the copies of the curriculum inside the training's environments."""

@@ -295,7 +295,12 @@ def _env_id(task: str) -> str:
 
 
 def _config(env_id: str, method: str, seed: int, settings: Settings, threads: int) -> RunConfig:
-    overrides: dict[str, Any] = {"n_threads": threads, "torch_threads": threads}
+    # None ends early: methods are compared after equally many steps.
+    overrides: dict[str, Any] = {
+        "n_threads": threads,
+        "torch_threads": threads,
+        "solved_at": 0.0,
+    }
     if settings.steps is not None:
         overrides["n_timesteps"] = settings.steps
     if settings.paper_evaluation:

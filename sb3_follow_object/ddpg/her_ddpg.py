@@ -71,6 +71,7 @@ class HerDDPG(KeptDDPG):
             through the targets. Beyond the paper; for rewards of -1 and 0, objects that can be
             made to stay, and a `FollowObjectReplayBuffer`.
         target_update_interval: in gradient updates, >= 1. The authors: once a cycle of 40.
+        policy_delay: critic updates for each of the actor, >= 1, as TD3 has it. Beyond the paper.
         average_decay: share in [0, 1) that an update leaves of the averaged actor, which `predict`,
             validation and saved policies use while the actor itself explores and learns; 0, the
             actor itself. Beyond the paper: the actor's success moves up and down by a tenth and
@@ -122,6 +123,7 @@ class HerDDPG(KeptDDPG):
         target_clip: tuple[float, float] | str | None = AlgorithmSettings.target_clip,
         hindsight_bound: bool = AlgorithmSettings.hindsight_bound,
         target_update_interval: int = AlgorithmSettings.target_update_interval,
+        policy_delay: int = AlgorithmSettings.policy_delay,
         average_decay: float = AlgorithmSettings.average_decay,
         matmul_precision: str = AlgorithmSettings.matmul_precision,
         auxiliary: dict[str, Any] | None = AlgorithmSettings.auxiliary,
@@ -153,6 +155,7 @@ class HerDDPG(KeptDDPG):
             target_clip=target_clip,
             hindsight_bound=hindsight_bound,
             target_update_interval=target_update_interval,
+            policy_delay=policy_delay,
             average_decay=average_decay,
             matmul_precision=matmul_precision,  # type: ignore[arg-type]  # checked there
             auxiliary=auxiliary,
@@ -195,6 +198,7 @@ class HerDDPG(KeptDDPG):
         self.target_clip = settings.target_clip
         self.hindsight_bound = settings.hindsight_bound
         self.target_update_interval = settings.target_update_interval
+        self.policy_delay = settings.policy_delay
         self.average_decay = settings.average_decay
         self.matmul_precision: str = settings.matmul_precision
         self.update_threads = settings.update_threads
@@ -334,7 +338,7 @@ class HerDDPG(KeptDDPG):
         self.policy.update_average(decay if self.average_decay > 0.0 else 0.0)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, value in zip(COLUMNS, th.cat(told).mean(dim=0).tolist(), strict=True):
+        for name, value in zip(COLUMNS, th.cat(told).nanmean(dim=0).tolist(), strict=True):
             self.logger.record(f"train/{name}", value)
         for name, mean in (auxiliary.take_log() if auxiliary else {}).items():
             self.logger.record(name, mean)

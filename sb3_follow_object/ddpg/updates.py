@@ -26,6 +26,7 @@ class Learner(Protocol):
     action_l2: float
     hindsight_bound: bool
     target_update_interval: int
+    policy_delay: int
     auxiliary_critic: AuxiliaryCritic | None
     _n_updates: int
 
@@ -123,7 +124,7 @@ class Updates:
         """
         model, auxiliary, policy = self._model, self._model.auxiliary_critic, self._model.policy
         critic, critics = policy.critic, policy.critic.q_networks
-        actor, actor_target = policy.actor.mu, policy.actor_target.mu
+        actor_target = policy.actor_target.mu
         x, next_x = inputs["features"], inputs["next_features"]
         rewards, dones = inputs["rewards"], inputs["dones"]
         with th.no_grad():
@@ -143,24 +144,31 @@ class Updates:
             assert batch is not None
             auxiliary.update(batch, critic_in, next_in, dones)
 
-        # The actor's gradient passes through the critic, whose own is not wanted.
-        critic.requires_grad_(False)
-        policy_actions = actor(x)
-        actor_critic_in = th.cat([x, policy_actions], dim=1)
-        q = critics[0](actor_critic_in).mean()
-        value = q if auxiliary is None else q + auxiliary.value(actor_critic_in)
-        actor_loss = -value + model.action_l2 * policy_actions.square().mean()
-        policy.actor.optimizer.zero_grad()
-        actor_loss.backward()
-        policy.actor.optimizer.step()
-        critic.requires_grad_(True)
-
+        told = [critic_loss.detach(), *self._actor_step(x, number), rewards.mean()]
         if number % model.target_update_interval == 0:
             live, target = parameters
             with th.no_grad():
                 th._foreach_lerp_(target, live, model.tau)
-        told = (critic_loss.detach(), actor_loss.detach(), q.detach(), rewards.mean())
         return th.stack(told)
+
+    def _actor_step(self, x: th.Tensor, number: int) -> tuple[th.Tensor, th.Tensor]:
+        """Take the actor's part of a step when it is due; return its loss and the value of x."""
+        model, auxiliary, policy = self._model, self._model.auxiliary_critic, self._model.policy
+        if number % model.policy_delay:
+            none = x.new_full((), th.nan)
+            return none, none
+        # The actor's gradient passes through the critic, whose own is not wanted.
+        policy.critic.requires_grad_(False)
+        actions = policy.actor.mu(x)
+        critic_in = th.cat([x, actions], dim=1)
+        q = policy.critic.q_networks[0](critic_in).mean()
+        value = q if auxiliary is None else q + auxiliary.value(critic_in)
+        loss = -value + model.action_l2 * actions.square().mean()
+        policy.actor.optimizer.zero_grad()
+        loss.backward()
+        policy.actor.optimizer.step()
+        policy.critic.requires_grad_(True)
+        return loss.detach(), q.detach()
 
     def _run_on_cuda(self, inputs: dict[str, th.Tensor], batch_size: int) -> th.Tensor:
         optimizers = (self._model.policy.actor.optimizer, self._model.policy.critic.optimizer)
@@ -192,7 +200,11 @@ class Updates:
         return (
             len(inputs["rewards"]),
             batch_size,
-            tuple((model._n_updates + i) % model.target_update_interval == 0 for i in numbers),
+            tuple(
+                (model._n_updates + i) % interval == 0
+                for interval in (model.target_update_interval, model.policy_delay)
+                for i in numbers
+            ),
             tuple(group["lr"] for optimizer in optimizers for group in optimizer.param_groups),
             tuple(
                 value.data_ptr()

@@ -66,6 +66,9 @@ class FollowObject:
             pushing. The paper's object may always leave it.
         object_n_envs: parallel copies of the object's environment, >= 1.
         object_timesteps: env steps after which the object stage gives up.
+        object_test_every: rollouts of every copy between two tests of the object's policy.
+        object_test_episodes: episodes of such a test.
+        object_success: success rate of two such tests in a row that ends the object's stage.
         n_paths: noise-free object paths that F_phi is fitted on.
         predictor_fit: keyword arguments of `GoalPredictor.fit`.
         inverse_fit: keyword arguments of `ObjectNetworks.learned`, about the inverse model.
@@ -100,6 +103,9 @@ class FollowObject:
         object_on_table: bool | None = StageSettings.object_on_table,
         object_n_envs: int = StageSettings.object_n_envs,
         object_timesteps: int = StageSettings.object_timesteps,
+        object_test_every: int = StageSettings.object_test_every,
+        object_test_episodes: int = StageSettings.object_test_episodes,
+        object_success: float = StageSettings.object_success,
         n_paths: int = StageSettings.n_paths,
         predictor_fit: dict[str, Any] | None = None,
         inverse_fit: dict[str, Any] | None = None,
@@ -122,6 +128,9 @@ class FollowObject:
             "object_on_table": object_on_table,
             "object_n_envs": object_n_envs,
             "object_timesteps": object_timesteps,
+            "object_test_every": object_test_every,
+            "object_test_episodes": object_test_episodes,
+            "object_success": object_success,
             "n_paths": n_paths,
             "predictor_fit": predictor_fit or {},
             "inverse_fit": inverse_fit or {},

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..common.numbers import checked_number, checked_whole
 from ..settings.stages import CurriculumSettings
+from .sequential_test import SequentialTest
 
 
 class Curriculum:
@@ -22,6 +23,8 @@ class Curriculum:
         horizon: T, steps of an episode, >= 1.
         p: probability of the original goal, in [0, 1].
         threshold: success rate at k_max that raises k_max, in [0, 1].
+        sequential: whether the tests of a level add up until they decide (`SequentialTest`), so
+            that chance cannot pass it; otherwise each stands alone (paper).
         finish_threshold: success rate at the last level that ends the curriculum, in [0, 1]; until
             then imagined goals of all levels go on. 0 is the paper's: reaching that level ends it.
         k_max: first value of k_max, in 1..n_levels.
@@ -41,6 +44,7 @@ class Curriculum:
         *,
         p: float = CurriculumSettings.p,
         threshold: float = CurriculumSettings.threshold,
+        sequential: bool = CurriculumSettings.sequential,
         finish_threshold: float = CurriculumSettings.finish_threshold,
         k_max: int = CurriculumSettings.k_max,
         levels: str = CurriculumSettings.levels,
@@ -51,6 +55,7 @@ class Curriculum:
         settings = CurriculumSettings(
             p=p,
             threshold=threshold,
+            sequential=sequential,
             finish_threshold=finish_threshold,
             k_max=k_max,
             levels=levels,  # type: ignore[arg-type]  # a word is checked there
@@ -68,6 +73,7 @@ class Curriculum:
         self.min_distance = settings.min_distance
         self.k_max = checked_whole("k_max", settings.k_max, 1, self.n_levels)
         self._passed_last = False
+        self._tests = SequentialTest() if settings.sequential else None
 
     @property
     def finished(self) -> bool:
@@ -98,18 +104,27 @@ class Curriculum:
         first = self.k_max if self.sampling == "max" else 1
         return np.arange(first, self.k_max + 1)
 
-    def report(self, success_rate: float) -> bool:
+    def report(self, success_rate: float, n_episodes: int = 1) -> bool:
         """Take in a test at level k_max; return whether k_max grew or the curriculum ended.
 
         Args:
             success_rate: share of successful test episodes, in [0, 1].
+            n_episodes: of the test, >= 1; tests that add up weigh by it.
 
         Raises:
-            ValueError: ``success_rate`` is outside [0, 1].
+            ValueError: ``success_rate`` is outside [0, 1], or ``n_episodes`` below 1.
         """
         success_rate = checked_number("success_rate", success_rate, 0.0, 1.0)
+        n_episodes = checked_whole("n_episodes", n_episodes, 1)
+        if self.finished:
+            return False
         at_last = self.k_max == self.n_levels
-        if self.finished or success_rate < (self.finish_threshold if at_last else self.threshold):
+        threshold = self.finish_threshold if at_last else self.threshold
+        if self._tests is None:
+            passed = success_rate >= threshold
+        else:
+            passed = self._tests.passes(success_rate, n_episodes, threshold)
+        if not passed:
             return False
         if at_last:
             self._passed_last = True
@@ -124,6 +139,7 @@ class Curriculum:
             "passed_last": self._passed_last,
             "levels": self.levels,
             "n_levels": self.n_levels,
+            **({} if self._tests is None else {"evidence": self._tests.evidence}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -143,3 +159,5 @@ class Curriculum:
             )
         self.k_max = checked_whole("k_max", state["k_max"], 1, self.n_levels)
         self._passed_last = bool(state["passed_last"])
+        if self._tests is not None:
+            self._tests.evidence = float(state.get("evidence", 0.0))

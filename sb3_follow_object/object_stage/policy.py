@@ -15,6 +15,7 @@ from ..callbacks.rollout import run_episodes
 from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs import IDS
+from ..settings.stages import StageSettings
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,9 @@ class StopWhenSolved(CopyableCallback):
     def __init__(
         self,
         test_env: VecEnv,
-        n_episodes: int = 64,
-        every_episodes: int = 8,
-        success_rate: float = 0.98,
+        n_episodes: int = StageSettings.object_test_episodes,
+        every_episodes: int = StageSettings.object_test_every,
+        success_rate: float = StageSettings.object_success,
         report: Callable[[int, float], None] | None = None,
     ):
         super().__init__()
@@ -124,7 +125,9 @@ def train_object_policy(
     test_env: VecEnv,
     total_timesteps: int = 400_000,
     *,
-    success_rate: float = 0.98,
+    n_test_episodes: int = StageSettings.object_test_episodes,
+    test_every: int = StageSettings.object_test_every,
+    success_rate: float = StageSettings.object_success,
     seed: int | None = None,
     report: Callable[[int, float], None] | None = None,
     callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
@@ -137,6 +140,8 @@ def train_object_policy(
         env: vectorised object-only environment, e.g. of FollowObject/PnPShelfObject-v0.
         test_env: fresh copies of it.
         total_timesteps: env steps after which training ends unsolved; tests are counted.
+        n_test_episodes: episodes a test, >= 1.
+        test_every: training episodes of each copy between two tests, >= 1.
         success_rate: noise-free success that counts as solved, in two tests in a row.
         seed: of networks, noise and replay.
         report: called with (env_steps, success rate) after each test.
@@ -147,7 +152,7 @@ def train_object_policy(
     Returns:
         The algorithm and the callback that knows the test results.
     """
-    solved = StopWhenSolved(test_env, success_rate=success_rate, report=report)
+    solved = StopWhenSolved(test_env, n_test_episodes, test_every, success_rate, report)
     model = HerDDPG("MultiInputPolicy", env, seed=seed, **algorithm_kwargs)
     if state is not None:
         solved.load_state_dict(state, model, env)

@@ -54,6 +54,7 @@ class ReachPolicy(WholeCopies):
     action_l2 = 1.0
     hindsight_bound = True
     target_update_interval = 1
+    policy_delay = 1
     auxiliary_critic: AuxiliaryCritic | None = None
     device = th.device("cpu")  # the networks are small
 

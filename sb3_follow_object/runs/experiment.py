@@ -30,7 +30,7 @@ from ..settings.run_config import RunConfig
 from ..settings.sizes import check_sizes, idle_robot
 from .checkpoints import Checkpoints, checkpoint_files, load_newest
 from .object_stage_files import load_object_stage, save_object_stage
-from .run_callbacks import CheckpointCallback, Progress, RunCallback, StopSignals
+from .run_callbacks import CheckpointCallback, Progress, RunCallback, Solved, StopSignals
 from .run_folder import (
     CROSS_TESTS,
     EVALUATIONS,
@@ -127,10 +127,10 @@ def train(
                 )
             if object_stage_only:
                 return {}
-            wall_s = _robot_stage(
+            wall_s, solved = _robot_stage(
                 config, folder, run, loaded, wall_before, checkpoints, stop, progress
             )
-            result = _final_test(config, folder, run, wall_s, stop, command)
+            result = _final_test(config, folder, run, wall_s, solved, stop, command)
             checkpoints.remove(keep_last=config.keep_last_checkpoint)
             return result
         except Exception as error:
@@ -147,8 +147,12 @@ def _robot_stage(
     checkpoints: Checkpoints,
     stop: StopSignals,
     progress: Progress,
-) -> float:
-    """Run what is left of the robot's stage; return the seconds that all stages took."""
+) -> tuple[float, bool]:
+    """Run what is left of the robot's stage.
+
+    Returns:
+        The seconds that all stages took, and whether it ended early because the task was solved.
+    """
     saved = loaded.pop()
     if saved is not None and saved["stage"] != "robot":
         saved = None
@@ -172,7 +176,9 @@ def _robot_stage(
         wall_before=wall_before,
         seed=stream_seed(config.seed, "validation"),
     )
-    keeper = RunCallback(run, evaluation, folder, progress)
+    keeper = RunCallback(
+        run, evaluation, folder, progress, config.solved_at, config.solved_validations
+    )
     if saved is not None:
         keeper.load_state_dict(saved)
         checkpoints.take_memory(keeper.state_dict())
@@ -192,9 +198,18 @@ def _robot_stage(
     writer = CheckpointCallback(
         checkpoints, keeper.state_dict, lambda: run.env_steps, config.checkpoint_minutes, stop
     )
-    run.learn(config.total_timesteps, callback=CallbackList([evaluation, keeper, writer]))
+    solved = False
+    try:
+        run.learn(config.total_timesteps, callback=CallbackList([evaluation, keeper, writer]))
+    except Solved:
+        solved = True
+        writer.write()
+        run.report(
+            f"solved after {run.env_steps} env steps of {config.total_timesteps}: "
+            f"{config.solved_validations} validations in a row of {config.solved_at:g} or more"
+        )
     eval_env.close()
-    return evaluation.wall_s
+    return evaluation.wall_s, solved
 
 
 def _final_test(
@@ -202,6 +217,7 @@ def _final_test(
     folder: Path,
     run: FollowObject,
     wall_s: float,
+    solved: bool,
     stop: StopSignals,
     command: str,
 ) -> dict[str, Any]:
@@ -223,6 +239,7 @@ def _final_test(
         "episodes": config.n_final_episodes,
         "command": noted_command(folder, command),
         "k_max": run.curriculum.k_max if run.imagine else None,
+        **({"solved": True} if solved else {}),  # and ended before its steps were gone
     }
     (folder / CROSS_TESTS).unlink(missing_ok=True)  # of an earlier policy
     atomic_write(folder / RESULT, json.dumps(result, indent=2).encode())

@@ -84,25 +84,34 @@ class CheckpointCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         self.checkpoints.poll()
         if self.stop.requested or time.monotonic() - self._last > 60.0 * self.minutes:
-            self._write()
+            self.write()
         self.stop.check()
 
     def _on_training_end(self) -> None:
-        self._write()
+        self.write()
 
-    def _write(self) -> None:
+    def write(self) -> None:
+        """Write a checkpoint, between two rollouts."""
         self.checkpoints.write(self.env_steps(), self.state())
         self._last = time.monotonic()
 
 
+class Solved(Exception):
+    """A robot's stage can end, between two rollouts: the task is solved and stays so."""
+
+
 class RunCallback(BaseCallback):
     """Saves the policy at each validation, and the best one apart, and reports progress.
+
+    Raises `Solved` once enough validations in a row have gone well enough.
 
     Args:
         run: what is trained.
         evaluation: its validation callback, which runs before this one.
         folder: of the run.
         progress: called with the current figures after each rollout.
+        solved_at: success rate that is enough; 0, none is.
+        solved_validations: how many must be in a row.
     """
 
     def __init__(
@@ -111,13 +120,18 @@ class RunCallback(BaseCallback):
         evaluation: OriginalGoalEvalCallback,
         folder: Path,
         progress: Progress,
+        solved_at: float = 0.0,
+        solved_validations: int = 1,
     ):
         super().__init__()
         self.run = run
         self.evaluation = evaluation
         self.folder = folder
         self.progress = progress
+        self.solved_at = solved_at
+        self.solved_validations = solved_validations
         self.best = -1.0
+        self._n_solved = 0  # validations in a row
         self._n_validated = 0
 
     def _on_step(self) -> bool:
@@ -132,6 +146,7 @@ class RunCallback(BaseCallback):
             self._n_validated = n_validated
             rate = self.evaluation.success_rate
             assert rate is not None
+            self._n_solved = self._n_solved + 1 if rate >= self.solved_at else 0
             self.run.save_policy(self.folder / POLICY)
             if rate >= self.best:
                 self.best = rate
@@ -144,6 +159,8 @@ class RunCallback(BaseCallback):
                 "success_rate": self.evaluation.success_rate,
             }
         )
+        if self.solved_at and self._n_solved >= self.solved_validations:
+            raise Solved
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that resuming the third stage needs."""
@@ -153,6 +170,7 @@ class RunCallback(BaseCallback):
             "evaluation": self.evaluation.state_dict(),
             "best": self.best,
             "n_validated": self._n_validated,
+            "n_solved": self._n_solved,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -161,3 +179,4 @@ class RunCallback(BaseCallback):
         self.evaluation.load_state_dict(state["evaluation"])
         self.best = state["best"]
         self._n_validated = state["n_validated"]
+        self._n_solved = int(state.get("n_solved", 0))

@@ -115,7 +115,7 @@ def finished_result(folder: Path, config: RunConfig) -> dict[str, Any] | None:
     if not (folder / RESULT).exists():
         return None
     result = read_result(folder)
-    if result["env_steps"] >= config.total_timesteps:
+    if result["env_steps"] >= config.total_timesteps or result.get("solved"):
         return result
     if not checkpoint_files(folder):
         raise ValueError(

@@ -225,6 +225,7 @@ class AlgorithmSettings(Group):
     target_update_interval: Annotated[
         Whole, setting("updates between two moves of the targets", ge=1)
     ] = 1
+    policy_delay: Annotated[Whole, setting("critic updates for each of the actor", ge=1)] = 1
     average_decay: Annotated[
         Number,
         setting("share that an update leaves of the averaged actor; 0, none", ge=0, lt=1),

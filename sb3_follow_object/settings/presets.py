@@ -27,6 +27,7 @@ PRESETS = ("default", "paper")
 
 WRAPPER = "sb3_follow_object.ImaginedGoalWrapper"
 CALLBACK = "sb3_follow_object.CurriculumCallback"
+OF_RUNS = "sb3-follow-object"  # an entry for all tasks that rl_zoo3 does not look at
 REACH_WRAPPER = "sb3_follow_object.ReachFirstWrapper"
 REACH_CALLBACK = "sb3_follow_object.ReachCallback"
 _KNOWN = {"env_wrapper": (WRAPPER, REACH_WRAPPER), "callback": (CALLBACK, REACH_CALLBACK)}
@@ -88,7 +89,7 @@ def run_config(
     entries = read_yaml(path)
     entry = _entry(entries, env_id, path)
     imagine = WRAPPER in _named(entry, "env_wrapper", path)
-    settings = _flattened(entry, path)
+    settings = _of_runs(entries, path) | _flattened(entry, path)
     has_object_stage = imagine or _auxiliary_name(settings) == "sldr"
     if has_object_stage and env_id not in IDS:
         robots = sorted(name for name, (_, alone) in IDS.items() if not alone)
@@ -244,6 +245,15 @@ def _named(entry: dict[str, Any], key: str, path: Path) -> dict[str, dict[str, A
         if not isinstance(arguments, dict):
             raise ValueError(f"{path}: the arguments of {name} are not a mapping")
     return named
+
+
+def _of_runs(entries: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the settings of all tasks that are a run's or the three stages', not rl_zoo3's."""
+    given = entries.get(OF_RUNS) or {}
+    if not isinstance(given, dict):
+        raise ValueError(f"{path}: the settings of {OF_RUNS!r} are not a mapping")
+    check_names(given, {**_known(RunConfig), **_known(StageSettings)}, f"{path}: {OF_RUNS}")
+    return dict(_plain(given))
 
 
 def _flattened(entry: dict[str, Any], path: Path) -> dict[str, Any]:

@@ -27,6 +27,9 @@ class RunConfig(Group):
         eval_every: env steps between two validations on original goals, >= 1.
         n_eval_episodes: episodes a validation, >= 1; its steps are not counted, nothing learns
             from them.
+        solved_at: success rate of `solved_validations` validations in a row that ends the run
+            before its steps; 0, none does.
+        solved_validations: see `solved_at`, >= 1.
         n_final_episodes: fresh episodes of the last policy's final test, >= 1.
         checkpoint_minutes: wall time between two checkpoints, > 0; does not change the result.
         keep_checkpoints: how many of the last checkpoints are kept, >= 1.
@@ -58,6 +61,12 @@ class RunConfig(Group):
     n_eval_episodes: Annotated[
         Whole, setting("episodes of a validation; nothing learns from them", ge=1)
     ] = 76
+    solved_at: Annotated[
+        Number, setting("validated success rate that ends a run early; 0, none", ge=0, le=1)
+    ] = 0.0
+    solved_validations: Annotated[
+        Whole, setting("validations in a row that must reach it", ge=1)
+    ] = 3
     n_final_episodes: Annotated[
         Whole, setting("fresh episodes of the last policy's final test", ge=1)
     ] = 380

@@ -22,6 +22,9 @@ class CurriculumSettings(Group):
     threshold: Annotated[Number, setting("success rate at k_max that raises k_max", ge=0, le=1)] = (
         0.25
     )
+    sequential: Annotated[
+        Flag, setting("whether tests of a level add up until they decide, or each stands alone")
+    ] = False
     finish_threshold: Annotated[
         Number,
         setting("success rate at the last level that ends the curriculum; 0, none", ge=0, le=1),
@@ -172,6 +175,13 @@ class StageSettings(Group):
     object_timesteps: Annotated[
         Whole, setting("env steps after which the object's stage gives up", ge=1)
     ] = 400_000
+    object_test_every: Annotated[
+        Whole, setting("rollouts of every copy between two tests of the object", ge=1)
+    ] = 8
+    object_test_episodes: Annotated[Whole, setting("episodes of such a test", ge=1)] = 64
+    object_success: Annotated[
+        Number, setting("success rate of two such tests in a row that ends its stage", ge=0, le=1)
+    ] = 0.98
     n_paths: Annotated[Whole, setting("object paths that F_phi is fitted on", ge=2, le=10**6)] = 512
     predictor_fit: Annotated[
         dict[str, Any] | None, setting("of F_phi", none="{}", group=PredictorSettings)

@@ -201,3 +201,62 @@ def test_finish_threshold_keeps_imagining_until_the_last_level_is_passed() -> No
     assert curriculum.draw(100, np.random.default_rng(0))[0].all()
     resumed.load_state_dict(curriculum.state_dict())
     assert resumed.finished and not resumed.report(1.0)
+
+
+def sequential(**settings: Any) -> Curriculum:
+    return Curriculum(50, levels="path", n_levels=25, sequential=True, **settings)
+
+
+def test_sequential_tests_need_seven_of_sixteen_or_several_that_add_up() -> None:
+    at_once, in_two, never = sequential(), sequential(), sequential()
+    assert not sequential().report(6 / 16, 16)
+    assert at_once.report(7 / 16, 16) and at_once.k_max == 3
+    assert not in_two.report(5 / 16, 16) and in_two.report(6 / 16, 16)
+    assert not any(never.report(4 / 16, 16) for _ in range(100))
+
+
+def test_sequential_tests_forget_the_failures_of_long_ago_and_begin_anew_at_each_level() -> None:
+    curriculum = sequential()
+    for _ in range(50):
+        assert not curriculum.report(0.0, 16)
+    assert curriculum.report(7 / 16, 16)
+    assert not curriculum.report(5 / 16, 16), "what the level before had left counts no more"
+
+
+def test_a_level_with_a_rate_of_a_tenth_is_seldom_passed_by_chance() -> None:
+    """Of a hundred tests each: by chance most single tests pass it, hardly any sequential ones."""
+    rng = RNG(0)
+    passed = {True: 0, False: 0}
+    for adds_up in passed:
+        for _ in range(200):
+            curriculum = Curriculum(50, sequential=adds_up)
+            passed[adds_up] += any(
+                curriculum.report(rng.binomial(16, 0.1) / 16, 16) for _ in range(100)
+            )
+    assert passed[False] > 190 and passed[True] < 40
+
+
+def test_a_level_with_a_rate_of_a_half_is_passed_within_a_test_or_two() -> None:
+    rng, tests = RNG(0), []
+    for _ in range(200):
+        curriculum, n = sequential(), 1
+        while not curriculum.report(rng.binomial(16, 0.5) / 16, 16):
+            n += 1
+        tests.append(n)
+    assert np.mean(tests) < 1.5
+
+
+def test_a_sequential_test_goes_on_from_its_state() -> None:
+    curriculum, another = sequential(), sequential()
+    curriculum.report(5 / 16, 16)
+    another.load_state_dict(json.loads(json.dumps(curriculum.state_dict())))
+    assert another.report(6 / 16, 16)
+    old = {name: value for name, value in curriculum.state_dict().items() if name != "evidence"}
+    another.load_state_dict(old)
+    assert not another.report(6 / 16, 16)
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.05, 0.5, 0.9, 1.0])
+def test_sequential_tests_take_every_threshold(threshold: float) -> None:
+    assert sequential(threshold=threshold).report(1.0, 100)
+    assert sequential(threshold=threshold).report(0.0, 16) == (threshold == 0.0)

@@ -18,6 +18,7 @@ from sb3_follow_object.runs.run_folder import difference
 from sb3_follow_object.settings.methods import METHODS, WITHOUT_PAPER
 from sb3_follow_object.settings.presets import (
     CALLBACK,
+    OF_RUNS,
     PRESETS,
     REACH_CALLBACK,
     REACH_WRAPPER,
@@ -369,3 +370,22 @@ def test_each_ablation_of_the_docs_changes_one_setting() -> None:
         found = difference(default, changed)
         assert found is not None, setting
         assert found[0].endswith(setting.split("=")[0]), setting
+
+
+def test_settings_of_all_tasks_that_rl_zoo3_does_not_know_have_an_entry_of_their_own(
+    tmp_path: Path,
+) -> None:
+    entries = {TASK: imagining(), OF_RUNS: {"n_paths": "2e2", "object_test_every": 2}}
+    file = tmp_path / "my.yml"
+    file.write_text(yaml.safe_dump(entries))
+    settings = run_config(TASK, file=file).settings
+    assert (settings["n_paths"], settings["object_test_every"]) == (200, 2)
+    assert run_config(TASK, file=file, overrides={"n_paths": 9}).settings["n_paths"] == 9
+    for given, sentence in (
+        ({"n_path": 200}, "my.yml: sb3-follow-object has no setting 'n_path'; did you mean"),
+        ({"batch_size": 8}, "my.yml: sb3-follow-object has no setting 'batch_size'"),
+        (3, "my.yml: the settings of 'sb3-follow-object' are not a mapping"),
+    ):
+        file.write_text(yaml.safe_dump({**entries, OF_RUNS: given}))
+        with pytest.raises(ValueError, match=sentence):
+            run_config(TASK, file=file)
