@@ -1,5 +1,7 @@
 """How Sphinx builds the site: `make docs` writes it to build/docs."""
 
+from sphinx.application import Sphinx
+
 import sb3_follow_object
 
 project = "sb3-follow-object"
@@ -30,3 +32,12 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
+
+
+def setup(app: Sphinx) -> None:
+    """Let links to CONTRIBUTING.md, which is at the repository's top, lead to its page."""
+    app.connect("source-read", _link_contributing)
+
+
+def _link_contributing(app: Sphinx, page: str, source: list[str]) -> None:
+    source[0] = source[0].replace("](../CONTRIBUTING.md", "](contributing.md")
