@@ -39,9 +39,9 @@ def column(file: Path, x: str, y: str) -> Column:
 
 
 def panels(*names: str) -> tuple[Figure, list[Any]]:
-    """Return a figure with one panel a logged name, against env steps."""
-    figure = Figure(figsize=(4.2 * len(names), 3.2), layout="constrained")
-    axes = list(figure.subplots(1, len(names), squeeze=False)[0])
+    """Return a figure with one panel a logged name, below each other, against env steps."""
+    figure = Figure(figsize=(5.2, 2.4 * len(names)), layout="constrained")
+    axes = list(figure.subplots(len(names), 1, squeeze=False)[:, 0])
     for axis, name in zip(axes, names, strict=True):
         axis.set(xlabel="env steps", title=name)
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))

@@ -16,6 +16,7 @@ extensions = [
     "sphinx_copybutton",
 ]
 myst_heading_anchors = 3  # the ids that repository browsers give headings
+highlight_language = "none"  # of blocks that name no language: command lines and folders
 copybutton_exclude = ".linenos, .gp"
 
 # Docstrings name things in single backticks: a link where the reference has the name, else code.
