@@ -8,7 +8,7 @@ INSTALLED := $(VENV)/.installed
 ENV ?= FollowObject/PnPShelf-v0
 RUN ?= runs/pnp-shelf
 
-.PHONY: train quick test lint settings bench test-mujoco-range test-foreign clean
+.PHONY: train quick test lint docs settings bench test-mujoco-range test-foreign clean
 
 train: $(INSTALLED)
 	$(BIN)/sb3-follow-object train --env $(ENV) --run $(RUN) --set torch_threads=2 --resume-or-start
@@ -48,6 +48,11 @@ lint: $(INSTALLED)
 	MYPYPATH=build/package $(BIN)/mypy -p sb3_follow_object
 	cd build/package && $(abspath $(BIN))/lint-imports --no-cache --no-logo $(CURDIR)/pyproject.toml
 
+# The site, in build/docs; what the pages show is tested by tests/docs.
+docs: $(INSTALLED)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html -d build/doctrees docs build/docs
+	@echo build/docs/index.html
+
 # The tables of settings in the docs are what the code says.
 settings: $(INSTALLED)
 	$(BIN)/python -m sb3_follow_object.settings.table docs/runs.md
@@ -56,7 +61,7 @@ settings: $(INSTALLED)
 $(INSTALLED): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install -c constraints.txt torch setuptools wheel
-	$(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[zoo,plots,video,ray,test]'
+	$(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[zoo,plots,video,ray,docs,test]'
 	touch $@
 
 clean:

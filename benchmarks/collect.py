@@ -4,9 +4,9 @@
 
 A row of summary.csv is replaced by a run of the same task, method and seed. Each run's policy,
 predictor, configuration, versions and learning curve are copied beside it, so that
-`sb3-follow-object evaluate benchmarks/results/<run>` tests it again. README's table is drawn from
-summary.csv: medians over seeds. Its figures, the paper's figures and the tables of final success
-are drawn from the copied runs.
+`sb3-follow-object evaluate benchmarks/results/<run>` tests it again. The tables of README and of
+docs/results.md are drawn from summary.csv: medians over seeds. The figures and the tables of final
+success are drawn from the copied runs.
 """
 
 from __future__ import annotations
@@ -20,12 +20,14 @@ from pathlib import Path
 from statistics import median
 
 from sb3_follow_object.comparison.cross import CROSS_TESTS
-from sb3_follow_object.comparison.figures import FINAL_SUCCESS, draw_results
+from sb3_follow_object.comparison.figures import draw_results
 from sb3_follow_object.comparison.plots import draw_curves
 from sb3_follow_object.comparison.results import read_results, write_tables
+from sb3_follow_object.envs import TASKS
 
 RESULTS = Path(__file__).parent / "results"
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
+README, PAGE = ROOT / "README.md", ROOT / "docs" / "results.md"
 BEGIN, END = "<!-- results: python benchmarks/collect.py -->\n", "<!-- end of results -->"
 COLUMNS = (
     "task",
@@ -40,12 +42,9 @@ COLUMNS = (
     "command",
     "commit",
 )
-FIGURE = (
-    "\n![Final success of every method on every task; hatched where there is none]"
-    f"(benchmarks/results/figures/{FINAL_SUCCESS})\n"
-)
-# README's curves, of all seeds of FO and HER.
+# The curves of docs/results.md, of all seeds of FO and HER.
 FEATURED = {"PnPSimpleV2": "pnp-simple-v2.png", "PnPShelf": "pnp-shelf.png"}
+FO_AND_HER = ("fo", "her")
 KEPT = ("config.json", "result.json", "versions.json", "evaluations.csv", "policy.safetensors")
 
 
@@ -70,7 +69,15 @@ def keep_files(run: Path, row: dict[str, str]) -> None:
         shutil.copytree(run / "predictor", target / "predictor", dirs_exist_ok=True)
 
 
-def table(rows: list[dict[str, str]]) -> str:
+Rows = list[dict[str, str]]
+
+
+def middle(rows: Rows, column: str) -> float:
+    """Return a column's median over seeds."""
+    return median(float(row[column]) for row in rows)
+
+
+def full_table(rows: Rows) -> str:
     """Return the results as a Markdown table, a line for each task and method."""
     lines = [
         "| task | method | seeds | env steps | minutes | success |",
@@ -79,13 +86,34 @@ def table(rows: list[dict[str, str]]) -> str:
     for (task, method), group in groupby(rows, key=lambda row: (row["task"], row["method"])):
         runs = list(group)
         seeds = ", ".join(row["seed"] for row in runs)
-        steps, seconds, rate = (
-            median(float(row[name]) for row in runs)
-            for name in ("env_steps", "wall_s", "success_rate")
-        )
-        cells = (task, method.upper(), seeds, f"{steps:,.0f}", f"{seconds / 60:.0f}", f"{rate:.2f}")
+        steps, minutes = middle(runs, "env_steps"), middle(runs, "wall_s") / 60
+        success = f"{middle(runs, 'success_rate'):.2f}"
+        cells = (task, method.upper(), seeds, f"{steps:,.0f}", f"{minutes:.0f}", success)
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def small_table(rows: Rows) -> str:
+    """Return FO beside HER as a Markdown table, a line for each of the paper's tasks."""
+    lines = ["| task | env steps | minutes | FO | HER |", "|---|---|---|---|---|"]
+    for task in TASKS:
+        fo, her = ([r for r in rows if (r["task"], r["method"]) == (task, m)] for m in FO_AND_HER)
+        steps, minutes = middle(fo, "env_steps"), middle(fo, "wall_s") / 60
+        rates = [f"{middle(runs, 'success_rate'):.2f}" if runs else "not run" for runs in (fo, her)]
+        lines.append(f"| {task} | {steps:,.0f} | {minutes:.0f} | {' | '.join(rates)} |")
+    return "\n".join(lines) + "\n"
+
+
+def with_table(text: str, table: str) -> str:
+    """Return a page with the table between its marks written anew."""
+    head, rest = text.split(BEGIN)
+    return head + BEGIN + table + END + rest.split(END)[1]
+
+
+def write_pages(rows: Rows) -> None:
+    """Write the tables of README and of the docs."""
+    for page, table in ((README, small_table(rows)), (PAGE, full_table(rows))):
+        page.write_text(with_table(page.read_text(), table))
 
 
 def main() -> None:
@@ -113,11 +141,9 @@ def main() -> None:
     write_tables(read_results(RESULTS), RESULTS)
     draw_results(RESULTS, RESULTS / "figures")
     for task, name in FEATURED.items():
-        wanted = [key for key in sorted(rows) if key[0] == task and key[1] in ("fo", "her")]
+        wanted = [key for key in sorted(rows) if key[0] == task and key[1] in FO_AND_HER]
         draw_curves([RESULTS / "-".join(key) for key in wanted], RESULTS / name)
-    text = README.read_text()
-    head, rest = text.split(BEGIN)
-    README.write_text(head + BEGIN + table(ordered) + FIGURE + END + rest.split(END)[1])
+    write_pages(ordered)
     print(f"{len(rows)} rows in {summary}")
 
 
