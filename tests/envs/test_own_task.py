@@ -205,8 +205,9 @@ def test_a_module_before_the_id_does_not_change_the_kind() -> None:
 
 @pytest.mark.usefixtures("own")
 def test_a_save_is_loaded_where_its_module_was_not_imported(tmp_path: Path) -> None:
-    network = {"policy_kwargs": {"net_arch": [8]}, "gradient_steps": 1, "batch_size": 8}
-    run = FollowObject(FULL, imagine=False, n_envs=1, n_threads=1, algorithm=network)
+    small = {"policy_kwargs": {"net_arch": [8]}, "gradient_steps": 1, "batch_size": 8}
+    small |= {"buffer_size": 100}
+    run = FollowObject(FULL, imagine=False, n_envs=1, n_threads=1, algorithm=small)
     run.learn(run.horizon).save(tmp_path / "save")
     run.close()
     code = "from sb3_follow_object import FollowObject\n"
