@@ -178,7 +178,8 @@ def test_commands_train_resume_and_test_it_in_processes_of_their_own(tmp_path: P
         return subprocess.run(line, env=env, cwd=tmp_path, capture_output=True, text=True)
 
     run = tmp_path / "run"
-    small = ["--n-envs", "2", "--threads", "1", "--set", *TINY, "keep_last_checkpoint=true"]
+    small = ["--n-envs", "2", "--threads", "1", "--set", *TINY]
+    small += ["keep_last_checkpoint=true", "eval_every=100000"]
     done = command("train", "--env", FULL, "--run", run, "--steps", "2400", *small)
     assert done.returncode == 0, done.stderr
     done = command("train", "--run", run, "--env", FULL, "--resume", "--steps", "3000")
