@@ -14,7 +14,8 @@ from sb3_follow_object.common.seeds import stream_seed
 from sb3_follow_object.envs import make_vec, physics_id
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
-from sb3_follow_object.runs.experiment import evaluate, train
+from sb3_follow_object.runs.evaluation import evaluate
+from sb3_follow_object.runs.experiment import train
 from sb3_follow_object.settings.presets import run_config
 from sb3_follow_object.settings.run_config import RunConfig
 

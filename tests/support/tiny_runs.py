@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sb3_follow_object.runs import experiment
+from sb3_follow_object.runs import evaluation, experiment
 from sb3_follow_object.settings.run_config import RunConfig
 
 TASK = "FollowObject/PushSideGap-v0"
@@ -37,7 +37,7 @@ def evaluate_in_few_copies() -> None:
 
     The others' simulation would take more than half of a tiny run's time.
     """
-    experiment._EVAL_COPIES = 4
+    evaluation._COPIES = 4
 
 
 def config(**changes: Any) -> RunConfig:
