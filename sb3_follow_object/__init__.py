@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .reach.vec_env import ReachFirstVecEnv as ReachFirstVecEnv
     from .reach.wrapper import ReachFirstWrapper as ReachFirstWrapper
     from .replay.her_replay_buffer import FollowObjectReplayBuffer as FollowObjectReplayBuffer
-    from .runs.experiment import evaluate as evaluate
+    from .runs.evaluation import evaluate as evaluate
     from .runs.experiment import train as train
     from .runs.predictor_cache import get_object_networks as get_object_networks
     from .runs.predictor_cache import get_predictor as get_predictor
@@ -57,7 +57,7 @@ _HOME = {
     "ReachFirstVecEnv": "reach.vec_env",
     "ReachFirstWrapper": "reach.wrapper",
     "RunConfig": "settings.run_config",
-    "evaluate": "runs.experiment",
+    "evaluate": "runs.evaluation",
     "get_object_networks": "runs.predictor_cache",
     "get_predictor": "runs.predictor_cache",
     "load_actor": "ddpg.actor_files",

@@ -15,6 +15,15 @@ from tree import PACKAGES, ROOT, run
 # Small networks and small scenes: more threads only make the test processes wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+
+@pytest.fixture(scope="session", autouse=True)
+def few_copies() -> None:
+    """What runs in the tests' own processes is tested on few episodes."""
+    import tiny_runs  # not before the line above
+
+    tiny_runs.evaluate_in_few_copies()
+
+
 DRAW_ONE_PICTURE = """
 import mujoco
 renderer = mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)

@@ -191,7 +191,7 @@ def _resumed_config(args: argparse.Namespace) -> RunConfig:
 
 def _evaluate(args: argparse.Namespace) -> None:
     from ..comparison.cross import cross_test
-    from ..runs.experiment import evaluate
+    from ..runs.evaluation import evaluate
     from ..runs.run_folder import POLICY, trained_steps
     from ..settings.presets import load_config
 

@@ -10,7 +10,7 @@ from typing import Any
 from ..common.files import atomic_write
 from ..common.reports import Report
 from ..envs.goal_envs import check_task
-from ..runs.experiment import evaluate
+from ..runs.evaluation import evaluate
 from ..runs.run_folder import CROSS_TESTS, POLICY
 from ..settings.presets import load_config
 from .grid import task_name

@@ -3,19 +3,40 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..common.numbers import checked_whole
 from ..common.torch_helpers import usable_device
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs import make_vec, object_id
 from ..reach.approach import BEHIND, check_reachable, reach_first_settings
-from ..settings.fields import settings_of
+from ..settings.fields import checked, settings_of
 from ..settings.learning import PredictorSettings
+from ..settings.run_config import check_plain
 from ..settings.sizes import check_stages
-from ..settings.stages import ReachFirstSettings, ReachTeachingSettings
+from ..settings.stages import ReachFirstSettings, ReachTeachingSettings, StageSettings
+
+
+def checked_settings(env_id: str, given: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    """Return the settings of a `FollowObject`; warn of one that a save could not hold.
+
+    Raises:
+        ValueError: one is unknown or out of range.
+    """
+    settings = {
+        "env_id": env_id,
+        **checked(StageSettings, given, "FollowObject"),
+        "seed": checked_whole("seed", seed, 0),
+    }
+    try:
+        check_plain(settings, "save()")
+    except ValueError as error:
+        warnings.warn(f"{error}; all else can be done", stacklevel=3)  # of who makes one
+    return settings
 
 
 def check_algorithms(

@@ -3,40 +3,32 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..callbacks.curriculum_callback import CurriculumCallback
-from ..callbacks.fresh_episodes import FreshEpisodes, begin_new_episodes
 from ..callbacks.reach_callback import ReachCallback
 from ..common.numbers import checked_whole
 from ..common.reports import Report
-from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
-from ..common.seeds import stream_seed
 from ..ddpg.actor_files import save_actor
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs.goal_envs import known_id
 from ..imagination.curriculum import Curriculum
 from ..imagination.goal_predictor import GoalPredictor
-from ..imagination.vec_env import ImaginedGoalVecEnv
 from ..object_stage.networks import FILE as OBJECT_FILE
 from ..object_stage.networks import ObjectNetworks
 from ..object_stage.sldr import reads_object_networks
 from ..object_stage.stage import ObjectStage
-from ..reach.vec_env import ReachFirstVecEnv
-from ..settings.fields import checked
 from ..settings.presets import run_config
 from ..settings.run_config import check_plain
 from ..settings.stages import StageSettings
-from .checks import check_algorithms, reach_parts
-from .robot_env import robot_env
+from .checks import check_algorithms, checked_settings
+from .robot_stage import RobotStage
 from .saved_folder import Saved, read, write
 
 
@@ -80,7 +72,7 @@ class FollowObject:
 
     Attributes:
         object_stage: the first two stages, what they learned and what they cost.
-        model: the robot's `HerDDPG`, once the third stage has begun.
+        robot_stage: the third.
 
     Raises:
         ValueError: unknown task, a predictor made for another one, or an argument out of range.
@@ -138,15 +130,7 @@ class FollowObject:
             "n_test_episodes": n_envs if n_test_episodes is None else n_test_episodes,
             "store_tests": store_tests,
         }
-        self.settings = {
-            "env_id": env_id,
-            **checked(StageSettings, given, "FollowObject"),
-            "seed": checked_whole("seed", seed, 0),
-        }
-        try:
-            check_plain(self.settings, "save()")
-        except ValueError as error:
-            warnings.warn(f"{error}; all else can be done", stacklevel=2)
+        self.settings = checked_settings(env_id, given, seed)
         self.env_id = env_id
         self.full_id = full_id  # with the module that registers it, as given
         self.imagine: bool = self.settings["imagine"]
@@ -157,13 +141,8 @@ class FollowObject:
             self.report,
             needs_networks=reads_object_networks(self.settings["algorithm"]),
         )
-        self.env: VecEnv = robot_env(self.settings, "robot")
-        self.horizon = int(self.env.get_attr("spec", indices=[0])[0].max_episode_steps)
-        self.curriculum = Curriculum(self.horizon, **self.settings["curriculum"])
+        self.robot_stage = RobotStage(self.settings)
         self._checked = False
-        self.model: HerDDPG | None = None
-        self.curriculum_callback: CurriculumCallback | None = None
-        self.reach_callback: ReachCallback | None = None
         if predictor is not None:
             self.object_stage.use_predictor(predictor)
         if object_networks is not None:
@@ -217,7 +196,35 @@ class FollowObject:
         """Env steps that the first two stages cost."""
         return self.object_stage.steps
 
-    # ---- stage three --------------------------------------------------------------------------
+    @property
+    def env(self) -> VecEnv:
+        """The copies of the task that the robot trains in."""
+        return self.robot_stage.env
+
+    @property
+    def horizon(self) -> int:
+        """T, steps of an episode."""
+        return self.robot_stage.horizon
+
+    @property
+    def curriculum(self) -> Curriculum:
+        """How far the imagined goals lie."""
+        return self.robot_stage.curriculum
+
+    @property
+    def model(self) -> HerDDPG | None:
+        """The robot's algorithm, once the third stage has begun."""
+        return self.robot_stage.model
+
+    @property
+    def curriculum_callback(self) -> CurriculumCallback | None:
+        """What tests k_max, once the third stage has begun; None without imagined goals."""
+        return self.robot_stage.curriculum_callback
+
+    @property
+    def reach_callback(self) -> ReachCallback | None:
+        """What learns to reach, once the third stage has begun; None without `reach`."""
+        return self.robot_stage.reach_callback
 
     @property
     def env_steps(self) -> int:
@@ -242,35 +249,15 @@ class FollowObject:
         if self.model is not None:
             return self.model
         self.check()
-        if self.imagine:
-            predictor = self.predictor or self.object_stage.learn_predictor()
-            test_env = robot_env(self.settings, "test")
-            self.env = ImaginedGoalVecEnv(self.env, predictor, self.curriculum)
-            test_env = ImaginedGoalVecEnv(test_env, predictor, self.curriculum, mode="test")
-            test_env.seed(stream_seed(self.seed, "test"))
-            self.curriculum_callback = CurriculumCallback(
-                test_env,
-                self.settings["n_test_episodes"],
-                every=self.settings["test_every"],
-                store=self.settings["store_tests"],
-            )
-        if self.settings.get("reach") is not None:
-            first, teaching = reach_parts(self.settings)
-            self.env = ReachFirstVecEnv(self.env, **first)
-            self.reach_callback = ReachCallback(stream_seed(self.seed, "reach"), **teaching)
-        arguments: dict[str, Any] = {"policy": "MultiInputPolicy", **self.settings["algorithm"]}
         stage = self.object_stage
-        if stage.needs_networks:
-            if stage.networks is None:
-                stage.learn_policy()
-            networks = {"object_networks": stage.networks}
-            arguments["auxiliary"] = {**arguments["auxiliary"], **networks}
-        self.model = HerDDPG(env=self.env, seed=stream_seed(self.seed, "networks"), **arguments)
-        if self.imagine and self.predictor is not None:
-            self.predictor.to(self.model.device)  # it imagines the goals of all copies at once
-        # SB3 seeds the environment too; a run's streams are its own.
-        self.env.seed(stream_seed(self.seed, "robot"))
-        return self.model
+        if self.imagine and stage.predictor is None:
+            stage.learn_predictor()
+        if stage.needs_networks and stage.networks is None:
+            stage.learn_policy()
+        return self.robot_stage.begin(
+            stage.predictor if self.imagine else None,
+            stage.networks if stage.needs_networks else None,
+        )
 
     def learn(
         self,
@@ -287,25 +274,10 @@ class FollowObject:
             log_interval: episodes between two log lines of SB3.
             progress_bar: SB3's.
         """
-        model = self.prepare()
+        self.prepare()
         remaining = checked_whole("total_timesteps", total_timesteps, 0) - self.env_steps
-        if remaining <= 0:
-            return self
-        callbacks: list[BaseCallback] = []
-        if env_state(self.env) is None:
-            callbacks.append(FreshEpisodes(lambda n: stream_seed(self.seed, f"robot {n}")))
-        own = (self.reach_callback, self.curriculum_callback)
-        callbacks += [each for each in own if each is not None]
-        for each in callback if isinstance(callback, list) else [callback]:
-            if each is not None:
-                callbacks.append(each if isinstance(each, BaseCallback) else ConvertCallback(each))
-        model.learn(
-            remaining,
-            callback=callbacks,
-            log_interval=log_interval,  # type: ignore[arg-type]
-            reset_num_timesteps=False,
-            progress_bar=progress_bar,
-        )
+        if remaining > 0:
+            self.robot_stage.learn(remaining, callback, log_interval, progress_bar)
         return self
 
     def predict(
@@ -320,48 +292,19 @@ class FollowObject:
 
     def state_dict(self, replay_buffer: bool = True) -> dict[str, Any]:
         """Return what `learn` has changed, at an episode's end of every copy."""
-        state: dict[str, Any] = {
+        return {
             "object_steps": self.object_steps,
             "object_success": self.object_stage.success,
-            "curriculum": self.curriculum.state_dict(),
+            **self.robot_stage.state_dict(replay_buffer),
         }
-        if self.model is not None:
-            state["model"] = self.model.training_state()
-            state["env"] = env_state(self.env)
-            state["generators"] = global_generators()
-            if self.reach_callback is not None:
-                state["reach"] = self.reach_callback.state_dict()
-            if self.curriculum_callback is not None:
-                state["callback"] = self.curriculum_callback.state_dict()
-                state["test_env"] = env_state(self.curriculum_callback.test_env)
-            if replay_buffer:
-                assert self.model.replay_buffer is not None
-                state["replay_buffer"] = self.model.replay_buffer.state_dict()
-        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`; the predictor must have been given already."""
         self.object_stage.steps = state["object_steps"]
         self.object_stage.success = state["object_success"]
-        self.curriculum.load_state_dict(state["curriculum"])
-        if "model" not in state:
-            return
-        model = self.prepare()
-        model.load_training_state(state["model"])
-        set_env_state(self.env, state["env"])
-        if self.reach_callback is not None:
-            self.reach_callback.load_state_dict(state["reach"], model)
-        if self.curriculum_callback is not None:
-            self.curriculum_callback.load_state_dict(state["callback"])
-            set_env_state(self.curriculum_callback.test_env, state["test_env"])
-        if "replay_buffer" in state:
-            assert model.replay_buffer is not None
-            model.replay_buffer.load_state_dict(state["replay_buffer"])
-        else:
-            model.expect_new_replay()
-        if state["env"] is None:
-            begin_new_episodes(model)
-        set_global_generators(state["generators"])
+        if "model" in state:
+            self.prepare()
+        self.robot_stage.load_state_dict(state)
 
     def save(self, folder: str | os.PathLike[str], replay_buffer: bool = True) -> None:
         """Save everything to a folder: settings, predictor and training state.
@@ -407,9 +350,7 @@ class FollowObject:
 
     def close(self) -> None:
         """Close all environments."""
-        self.env.close()
-        if self.curriculum_callback is not None:
-            self.curriculum_callback.test_env.close()
+        self.robot_stage.close()
 
 
 def _say_nothing(sentence: str) -> None:

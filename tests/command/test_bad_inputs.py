@@ -13,7 +13,7 @@ import yaml
 
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.object_stage.stage import ObjectStage
-from sb3_follow_object.runs import experiment
+from sb3_follow_object.runs.stages import RunStages
 from sb3_follow_object.settings.presets import run_config
 
 TASK = "FollowObject/PushSideGap-v0"
@@ -38,7 +38,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def accepted(*arguments: Any, **options: Any) -> None:
         raise AssertionError("the input was accepted")  # rather than trained for hours
 
-    monkeypatch.setattr(experiment, "_robot_stage", accepted)
+    monkeypatch.setattr(RunStages, "learn_robot_stage", accepted)
     monkeypatch.setattr(ObjectStage, "learn_predictor", accepted)
     return tmp_path
 

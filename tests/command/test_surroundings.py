@@ -18,7 +18,7 @@ from read_only import read_only_copy
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.common import extras
 from sb3_follow_object.comparison import compare, figures
-from sb3_follow_object.runs import experiment
+from sb3_follow_object.runs import experiment, stages
 from sb3_follow_object.runs.progress import ProgressBar, Terminal
 
 pytestmark = pytest.mark.xdist_group("surroundings")  # the tests share one run
@@ -231,16 +231,16 @@ def test_figures_that_cannot_be_drawn_cost_no_comparison(
 def test_a_broken_tensorboard_costs_its_log_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make = experiment.make_output_format
+    make = stages.make_output_format
 
     def fail(kind: str, *arguments: str) -> object:
         if kind == "tensorboard":
             raise TypeError("Descriptors cannot be created directly")
         return make(kind, *arguments)
 
-    monkeypatch.setattr(experiment, "make_output_format", fail)
+    monkeypatch.setattr(stages, "make_output_format", fail)
     told: list[str] = []
-    logger = experiment._logger(tmp_path, 0, told.append)
+    logger = stages._logger(tmp_path, 0, told.append)
     assert [path.name for path in tmp_path.iterdir()] == ["progress_0.csv"]
     assert told == ["left out the log for TensorBoard: Descriptors cannot be created directly"]
     logger.close()

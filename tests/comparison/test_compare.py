@@ -31,7 +31,7 @@ from sb3_follow_object.settings.presets import load_config, parse_override
 
 SETTINGS = Settings(steps=1000)
 TINY = ["policy_kwargs.net_arch=[8]", "batch_size=16", "gradient_steps=2", "n_envs=2"]
-TINY += ["eval_every=200", "n_eval_episodes=2", "n_final_episodes=2", "buffer_size=2000"]
+TINY += ["eval_every=400", "n_eval_episodes=2", "n_final_episodes=2", "buffer_size=2000"]
 
 
 class FakeExecutor:

@@ -29,7 +29,7 @@ def test_learns_to_reach(layer_norm: bool) -> None:
 
 def test_learns_fetch_reach() -> None:
     env = make_vec("FetchReach-v4", 2, seed=0)
-    model = HerDDPG("MultiInputPolicy", env, batch_size=128, seed=0)
+    model = HerDDPG("MultiInputPolicy", env, batch_size=128, buffer_size=10_000, seed=0)
     model.learn(1500, log_interval=None)  # type: ignore[arg-type]
     test_env = make_vec("FetchReach-v4", 2, seed=100)
     result = run_episodes(lambda obs: model.predict(obs, deterministic=True)[0], test_env, 10)
@@ -179,7 +179,8 @@ def test_target_networks_move_once_an_interval() -> None:
 
 def test_episodes_of_several_environments() -> None:
     env = make_vec("FetchReach-v4", 2, seed=0)
-    model = HerDDPG("MultiInputPolicy", env, seed=0, gradient_steps=1, batch_size=8)
+    tiny = {"gradient_steps": 1, "batch_size": 8, "buffer_size": 1000}
+    model = HerDDPG("MultiInputPolicy", env, seed=0, **tiny)
     model.learn(150, log_interval=None)  # type: ignore[arg-type]
     assert model.num_timesteps == 200  # whole episodes of 50 steps, two at a time
     assert model.gamma == pytest.approx(0.98)

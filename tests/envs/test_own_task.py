@@ -178,7 +178,8 @@ def test_commands_train_resume_and_test_it_in_processes_of_their_own(tmp_path: P
         return subprocess.run(line, env=env, cwd=tmp_path, capture_output=True, text=True)
 
     run = tmp_path / "run"
-    small = ["--n-envs", "2", "--threads", "1", "--set", *TINY, "keep_last_checkpoint=true"]
+    small = ["--n-envs", "2", "--threads", "1", "--set", *TINY]
+    small += ["keep_last_checkpoint=true", "eval_every=100000"]
     done = command("train", "--env", FULL, "--run", run, "--steps", "2400", *small)
     assert done.returncode == 0, done.stderr
     done = command("train", "--run", run, "--env", FULL, "--resume", "--steps", "3000")
@@ -205,8 +206,9 @@ def test_a_module_before_the_id_does_not_change_the_kind() -> None:
 
 @pytest.mark.usefixtures("own")
 def test_a_save_is_loaded_where_its_module_was_not_imported(tmp_path: Path) -> None:
-    network = {"policy_kwargs": {"net_arch": [8]}, "gradient_steps": 1, "batch_size": 8}
-    run = FollowObject(FULL, imagine=False, n_envs=1, n_threads=1, algorithm=network)
+    small = {"policy_kwargs": {"net_arch": [8]}, "gradient_steps": 1, "batch_size": 8}
+    small |= {"buffer_size": 100}
+    run = FollowObject(FULL, imagine=False, n_envs=1, n_threads=1, algorithm=small)
     run.learn(run.horizon).save(tmp_path / "save")
     run.close()
     code = "from sb3_follow_object import FollowObject\n"

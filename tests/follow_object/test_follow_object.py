@@ -14,16 +14,22 @@ from sb3_follow_object.common.seeds import stream_seed
 from sb3_follow_object.envs import make_vec, physics_id
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
-from sb3_follow_object.runs.experiment import evaluate, train
+from sb3_follow_object.runs.evaluation import evaluate
+from sb3_follow_object.runs.experiment import train
 from sb3_follow_object.settings.presets import run_config
 from sb3_follow_object.settings.run_config import RunConfig
 
 ENV = "FollowObject/PushSideGap-v0"
-SMALL_NET = {"batch_size": 32, "gradient_steps": 2, "policy_kwargs": {"net_arch": [16, 16]}}
+SMALL_NET: dict[str, Any] = {
+    "batch_size": 32,
+    "buffer_size": 2000,
+    "gradient_steps": 2,
+    "policy_kwargs": {"net_arch": [16, 16]},
+}
 TINY: dict[str, Any] = {
     "n_envs": 2,
     "n_threads": 1,
-    "algorithm": {**SMALL_NET, "buffer_size": 2000},
+    "algorithm": SMALL_NET,
     "object_algorithm": {**SMALL_NET, "gradient_steps": 1},
     "object_timesteps": 1600,
     "n_paths": 32,

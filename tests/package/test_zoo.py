@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
+import runpy
 import sys
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +21,7 @@ from sb3_follow_object.envs import TASKS
 from sb3_follow_object.runs.predictor_cache import CACHE_VARIABLE
 
 pytest.importorskip("rl_zoo3")
+pytestmark = pytest.mark.xdist_group("zoo")  # of one process, which imports rl_zoo3 once
 
 CONFIGS = PACKAGES["sb3_follow_object/zoo_configs"]
 STOCK = ["--gym-packages", "sb3_follow_object"]
@@ -41,20 +45,45 @@ def one_test(file: str, n_envs: int) -> int:
     return (options["every"] * n_envs + options["n_episodes"]) * HORIZON + 1
 
 
-def train(folder: Path, cache: Path, module: str, *arguments: str, n_envs: int, steps: int) -> str:
+def call(stock: bool, command: str, arguments: list[str], cache: object, fresh: bool) -> str:
+    """Run one of rl_zoo3's commands in the current folder; return what it said.
+
+    Args:
+        stock: as rl_zoo3 itself, which knows nothing of HerDDPG.
+        command: train or enjoy.
+        arguments: of the command.
+        cache: folder of the predictors.
+        fresh: in a process of its own, rather than in this one that has imported all already.
+    """
+    if fresh:
+        module = [f"rl_zoo3.{command}"] if stock else ["sb3_follow_object.zoo", command]
+        env = {**os.environ, CACHE_VARIABLE: str(cache)}
+        return run([sys.executable, "-m", *module, *arguments], env=env)
+    said = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
+        patch.setenv(CACHE_VARIABLE, str(cache))
+        patch.setattr(sys, "argv", [command, *arguments])
+        if stock:
+            runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
+        else:
+            assert zoo.main([command, *arguments]) == 0
+    return said.getvalue()
+
+
+def train(
+    cache: Path, *arguments: str, stock: bool, n_envs: int, steps: int, fresh: bool = False
+) -> str:
     """Train with a file's settings, but for the size of the networks."""
     options = ["--env", TASK, "-n", str(steps), "--seed", "1", "--log-interval", "1"]
-    options += ["--eval-freq", "100", "--eval-episodes", "1", "--num-threads", "1"]
+    options += ["--eval-freq", "200", "--eval-episodes", "1", "--num-threads", "1"]
     options += ["-params", *TINY, f"n_envs:{n_envs}"]
-    command = [sys.executable, "-m", *module.split(), *arguments, *options]
-    return run(command, cwd=folder, env={**os.environ, CACHE_VARIABLE: str(cache)})
+    return call(stock, "train", [*arguments, *options], cache, fresh)
 
 
-def play(folder: Path, module: str, *arguments: str) -> str:
+def play(*arguments: str, stock: bool, fresh: bool = False) -> str:
     """Play two episodes where no predictor can be had: none is needed."""
     options = ["--env", TASK, "-f", "logs", "-n", str(2 * HORIZON), "--no-render"]
-    command = [sys.executable, "-m", *module.split(), *arguments, *options]
-    return run(command, cwd=folder, env={**os.environ, CACHE_VARIABLE: os.devnull})
+    return call(stock, "enjoy", [*arguments, *options], os.devnull, fresh)
 
 
 def check_run(folder: Path, n_envs: int) -> None:
@@ -64,52 +93,60 @@ def check_run(folder: Path, n_envs: int) -> None:
     assert len(list(folder.glob("*.monitor.csv"))) == n_envs
 
 
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder, which commands run in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_stock_ddpg_trains_and_plays(n_envs: int, cache: Path, tmp_path: Path) -> None:
+def test_stock_ddpg_trains_and_plays(n_envs: int, cache: Path, folder: Path) -> None:
     stock = ["--algo", "ddpg", *STOCK]
     file = ["--conf-file", str(CONFIGS / "ddpg.yml")]
+    fresh = n_envs == 1
     steps = one_test("ddpg.yml", n_envs)
-    out = train(tmp_path, cache, "rl_zoo3.train", *stock, *file, n_envs=n_envs, steps=steps)
+    out = train(cache, *stock, *file, stock=True, n_envs=n_envs, steps=steps, fresh=fresh)
     for name in ("k_max", "test_success", "test_steps", "success_rate", "n_updates"):
         assert name in out
-    folder = tmp_path / "logs" / "ddpg" / "FollowObject-PushSideGap-v0_1"
-    check_run(folder, n_envs)
-    with open(folder / "0.monitor.csv") as file_:
+    logs = folder / "logs" / "ddpg" / "FollowObject-PushSideGap-v0_1"
+    check_run(logs, n_envs)
+    with open(logs / "0.monitor.csv") as file_:
         next(file_)  # the creation time
         assert "is_success" in next(csv.reader(file_))
-    if n_envs == 1:
-        assert "Success rate:" in play(tmp_path, "rl_zoo3.enjoy", *stock)
+    if fresh:
+        assert "Success rate:" in play(*stock, stock=True, fresh=True)
 
 
 @pytest.mark.parametrize(("method", "n_envs"), [("fo", 2), ("her", 1), ("sldr", 1), ("rher", 2)])
-def test_her_ddpg_trains_and_plays(method: str, n_envs: int, cache: Path, tmp_path: Path) -> None:
+def test_her_ddpg_trains_and_plays(method: str, n_envs: int, cache: Path, folder: Path) -> None:
     steps = one_test("fo.yml", n_envs) if method == "fo" else 4 * HORIZON
     file = [] if method == "fo" else ["--conf-file", str(CONFIGS / f"{method}.yml")]
-    module = "sb3_follow_object.zoo"
-    out = train(tmp_path, cache, f"{module} train", *file, n_envs=n_envs, steps=steps)
+    fresh = method == "fo"
+    out = train(cache, *file, stock=False, n_envs=n_envs, steps=steps, fresh=fresh)
     assert ("k_max" in out) == ("test_success" in out) == (method == "fo")
     assert "moved_share" in out  # only HerDDPG logs it
     assert ("sldr/" in out) == (method == "sldr")
     assert ("reach/" in out) == (method == "rher")
-    check_run(tmp_path / "logs" / "her_ddpg" / "FollowObject-PushSideGap-v0_1", n_envs)
+    check_run(folder / "logs" / "her_ddpg" / "FollowObject-PushSideGap-v0_1", n_envs)
     if method != "her":
-        assert "Success rate:" in play(tmp_path, f"{module} enjoy")
+        assert "Success rate:" in play(stock=False, fresh=fresh)
 
 
 @pytest.mark.parametrize("algorithm", ["ddpg", "tqc"])
-def test_stock_algorithms_reach_first(algorithm: str, cache: Path, tmp_path: Path) -> None:
+def test_stock_algorithms_reach_first(algorithm: str, cache: Path, folder: Path) -> None:
     entry = yaml.safe_load((CONFIGS / "ddpg.yml").read_text())["default"]
     entry["env_wrapper"].append({"sb3_follow_object.ReachFirstWrapper": {"height": 0.05}})
     teaching = {"share": 1.0, "n_updates": 2, "batch_size": 16}
     entry["callback"].insert(0, {"sb3_follow_object.ReachCallback": teaching})
-    (tmp_path / "reach.yml").write_text(yaml.safe_dump({TASK: entry}))
-    stock = ["--algo", algorithm, *STOCK, "--conf-file", "reach.yml"]
+    (folder / "reach.yml").write_text(yaml.safe_dump({TASK: entry}))
+    stock = ["--algo", algorithm, *STOCK]
     steps = one_test("ddpg.yml", 2)
-    out = train(tmp_path, cache, "rl_zoo3.train", *stock, n_envs=2, steps=steps)
+    out = train(cache, *stock, "--conf-file", "reach.yml", stock=True, n_envs=2, steps=steps)
     for name in ("share", "own_success", "k_max", "test_success"):
         assert name in out
-    check_run(tmp_path / "logs" / algorithm / "FollowObject-PushSideGap-v0_1", 2)
-    assert "Success rate:" in play(tmp_path, "rl_zoo3.enjoy", *stock[:4])
+    check_run(folder / "logs" / algorithm / "FollowObject-PushSideGap-v0_1", 2)
+    assert "Success rate:" in play(*stock, stock=True)
 
 
 def test_ddpg_file_has_every_task_with_its_horizon() -> None:

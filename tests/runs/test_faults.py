@@ -134,7 +134,8 @@ def test_diverged_single_environment_is_truncated() -> None:
 def test_diverged_episode_never_enters_the_buffer() -> None:
     env = make_vec(TASK, 3, 1, seed=0)
     Blown(env)
-    model = HerDDPG("MultiInputPolicy", env, buffer_size=3000, seed=0, **runs.SMALL_NET)
+    options = {**runs.SMALL_NET, "buffer_size": 3000}
+    model = HerDDPG("MultiInputPolicy", env, seed=0, **options)
     model.learn(2 * 3 * 50)
     buffer: Any = model.replay_buffer
     assert buffer.table.n_transitions() == 5 * 50

@@ -310,6 +310,7 @@ def test_killed_runs_resume(whole: dict[str, Any], tmp_path: Path) -> None:
         for half_written in folder.glob(".*.tmp"):  # of a kill before; the run itself removes them
             half_written.unlink()
         code = "import sys, tiny_runs as runs; from pathlib import Path; "
+        code += "runs.evaluate_in_few_copies(); "
         code += f"runs.run(Path(sys.argv[1]), resume={again > 0})"
         process = subprocess.Popen(
             [sys.executable, "-c", code, str(folder)], cwd=Path(__file__).parents[1] / "support"

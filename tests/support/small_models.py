@@ -20,6 +20,7 @@ TINY: dict[str, Any] = {
     "gradient_steps": 10,
     "train_freq": HORIZON,
     "gamma": 0.9,
+    "buffer_size": 10_000,  # SB3's default of a million takes a second to lay out
 }
 
 

@@ -6,15 +6,20 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sb3_follow_object.runs.experiment import train
+from sb3_follow_object.runs import evaluation, experiment
 from sb3_follow_object.settings.run_config import RunConfig
 
 TASK = "FollowObject/PushSideGap-v0"
-SMALL_NET = {"batch_size": 16, "gradient_steps": 2, "policy_kwargs": {"net_arch": [8]}}
+SMALL_NET: dict[str, Any] = {
+    "batch_size": 16,
+    "buffer_size": 2000,  # SB3's default of a million takes a second to lay out
+    "gradient_steps": 2,
+    "policy_kwargs": {"net_arch": [8]},
+}
 TINY: dict[str, Any] = {
     "n_envs": 2,
     "n_threads": 1,
-    "algorithm": {**SMALL_NET, "buffer_size": 2000},
+    "algorithm": SMALL_NET,
     "object_algorithm": SMALL_NET,
     "object_n_envs": 4,
     "object_timesteps": 1000,
@@ -25,6 +30,14 @@ TINY: dict[str, Any] = {
     "test_every": 1,
 }
 WALL = ("wall_s", "command")  # what no two runs share
+
+
+def evaluate_in_few_copies() -> None:
+    """Let validations and final tests simulate as many copies as the tiny runs want episodes.
+
+    The others' simulation would take more than half of a tiny run's time.
+    """
+    evaluation._COPIES = 4
 
 
 def config(**changes: Any) -> RunConfig:
@@ -48,7 +61,7 @@ def quiet(sentence: str) -> None:
 
 def run(folder: Path, **options: Any) -> dict[str, Any]:
     """Train the tiny run in a folder."""
-    return train(options.pop("config", config()), folder, report=quiet, **options)
+    return experiment.train(options.pop("config", config()), folder, report=quiet, **options)
 
 
 def outcome(folder: Path) -> dict[str, Any]:
