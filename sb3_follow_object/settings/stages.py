@@ -100,7 +100,7 @@ class ReachTeachingSettings(Group):
     ] = True
     n_updates: Annotated[
         Whole, setting("gradient steps of the reach policy after a rollout", ge=1)
-    ] = 40
+    ] = 120
     batch_size: Annotated[Whole, setting("transitions of each of them", ge=1, le=10**6)] = 256
 
 
