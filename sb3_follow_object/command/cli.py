@@ -255,9 +255,10 @@ def _named(out: Path, ending: str) -> Path:
 
 def _compare(args: argparse.Namespace) -> None:
     from ..common.files import lock
+    from ..comparison.cells import Settings
     from ..comparison.compare import Comparison, share_cores, write_report
     from ..comparison.executors import Executor, LocalExecutor
-    from ..comparison.grid import LOGS, Settings, plan
+    from ..comparison.grid import plan
     from ..comparison.grid_display import GridDisplay
     from ..envs.batch import cores
     from ..settings.presets import parse_override
@@ -269,7 +270,7 @@ def _compare(args: argparse.Namespace) -> None:
     executor: Executor
     if args.ray is None:
         jobs, threads = share_cores(cores(), n_runs, args.jobs, args.threads)
-        executor = LocalExecutor(jobs, args.out / LOGS)
+        executor = LocalExecutor(jobs, args.out / "logs")
     else:
         from ..comparison.ray_executor import RayExecutor, connect
 

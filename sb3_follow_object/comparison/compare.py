@@ -9,10 +9,11 @@ from pathlib import Path
 from ..common.reports import Trouble, reason
 from ..common.signals import stop_signals_to
 from ..runs.run_folder import POLICY, trained_steps
+from .cells import OBJECT, Cell, Settings, prepare, shared_stage, stage_is_ready
 from .cross import partner, read_cross_tests
 from .executors import Executor, Message
-from .grid import ATTEMPTS, OBJECT, Cell, Ledger, Settings, prepare, shared_stage, stage_is_ready
 from .grid_display import GridDisplay
+from .ledger import ATTEMPTS, Ledger
 from .worker import CROSS, STAGE, TRAIN, Job
 
 _POLL = 1.0  # seconds

@@ -13,7 +13,7 @@ from ..envs.goal_envs import check_task
 from ..runs.evaluation import evaluate
 from ..runs.run_folder import CROSS_TESTS, POLICY
 from ..settings.presets import load_config
-from .grid import task_name
+from .cells import task_name
 
 # Section 5.3: one task with two samplers of starts and goals; HER-a is trained on the first,
 # HER-b on the second, and each is tested on both.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,14 +10,20 @@ from typing import Any
 import numpy as np
 
 from ..common.extras import need
-from ..common.files import atomic_write
 from ..envs import TASKS
 from ..runs.run_folder import EVALUATIONS
 from ..settings.methods import METHODS
 from .cross import PAIR, read_cross_tests
-from .grid import FINISHED, UNFINISHED
-from .plots import X_AXES, Curve, read_curve, spread
-from .results import Group, group_runs, ordered, quartiles, read_results
+from .plots import X_AXES, Curve, read_curve, save_png, spread
+from .results import (
+    FINISHED,
+    UNFINISHED,
+    Group,
+    group_runs,
+    ordered,
+    quartiles,
+    read_results,
+)
 
 PNP_SIMPLE, OTHER_TASKS = "pnp_simple.png", "other_tasks.png"
 WALL_TIME, FINAL_SUCCESS = "wall_time.png", "final_success.png"
@@ -61,9 +66,7 @@ def draw_results(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     for name, draw in figures.items():
-        image = io.BytesIO()
-        draw().savefig(image, format="png", dpi=110)
-        atomic_write(out / name, image.getvalue())
+        save_png(draw(), out / name, dpi=110)
     return [out / name for name in figures]
 
 

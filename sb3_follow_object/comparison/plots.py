@@ -115,9 +115,14 @@ def draw_curves(folders: Sequence[str | os.PathLike[str]], out: str | os.PathLik
     axes[0][0].legend()
     if len(tasks) == 1:
         figure.suptitle(tasks[0])
+    save_png(figure, out, dpi=120)
+
+
+def save_png(figure: Any, path: str | os.PathLike[str], dpi: int) -> None:
+    """Write a figure of matplotlib's, whole or not at all."""
     image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=120)
-    atomic_write(out, image.getvalue())
+    figure.savefig(image, format="png", dpi=dpi)
+    atomic_write(path, image.getvalue())
 
 
 def _draw_group(axes: Any, shown: Sequence[str], group: Sequence[Curve], label: str) -> None:

@@ -18,7 +18,10 @@ from ..envs import TASKS
 from ..runs.run_folder import CONFIG, RESULT, read_result, trained_steps
 from ..settings.methods import METHODS
 from ..settings.presets import load_config
-from .grid import ATTEMPTS, FAILED, FINISHED, NOT_RUN, UNFINISHED, read_grid, task_name
+from .cells import task_name
+from .ledger import ATTEMPTS, read_grid
+
+FINISHED, FAILED, UNFINISHED, NOT_RUN = "finished", "failed", "unfinished", "not run"
 
 TABLE_CSV, TABLE_MD = "table.csv", "table.md"
 

@@ -96,9 +96,11 @@ def test_an_encoder_that_is_not_there_costs_the_film_alone(run: Path) -> None:
 @pytest.mark.parametrize(
     "variables",
     [
-        {"COLUMNS": "0", "TERM": "dumb", "PYTHONIOENCODING": "ascii"},
         {"COLUMNS": "1", "LC_ALL": "C", "LANG": ""},
         {
+            "COLUMNS": "0",
+            "TERM": "dumb",
+            "PYTHONIOENCODING": "ascii",
             "HOME": "/no/home",
             "XDG_CACHE_HOME": "/proc/no",
             "MPLCONFIGDIR": "/proc/no",

@@ -18,11 +18,13 @@ from result_folders import finish
 
 from sb3_follow_object.command import cli
 from sb3_follow_object.common.files import lock
+from sb3_follow_object.comparison.cells import Cell, Settings, prepare
 from sb3_follow_object.comparison.compare import Comparison, share_cores
 from sb3_follow_object.comparison.cross import CROSS_TESTS
 from sb3_follow_object.comparison.executors import LocalExecutor, Message
-from sb3_follow_object.comparison.grid import Cell, Settings, plan, prepare, read_grid
+from sb3_follow_object.comparison.grid import plan
 from sb3_follow_object.comparison.grid_display import GridDisplay
+from sb3_follow_object.comparison.ledger import read_grid
 from sb3_follow_object.comparison.worker import CROSS, STAGE, TRAIN, Job, run_job
 from sb3_follow_object.runs.experiment import train
 from sb3_follow_object.runs.object_stage_files import OBJECT_STAGE

@@ -7,15 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from sb3_follow_object.comparison.grid import (
-    Ledger,
-    Settings,
-    plan,
-    prepare,
-    read_grid,
-    shared_stage,
-    stage_settings,
-)
+from sb3_follow_object.comparison.cells import Settings, prepare, shared_stage, stage_settings
+from sb3_follow_object.comparison.grid import plan
+from sb3_follow_object.comparison.ledger import Ledger, read_grid
 from sb3_follow_object.runs.object_stage_files import OBJECT_STAGE
 from sb3_follow_object.runs.run_folder import CONFIG, RESULT, noted_command
 from sb3_follow_object.settings.methods import METHODS

@@ -17,7 +17,8 @@ import pytest
 from cli_runs import TINY
 from gymnasium.utils.env_checker import check_env
 
-from sb3_follow_object.comparison.grid import Settings, plan
+from sb3_follow_object.comparison.cells import Settings
+from sb3_follow_object.comparison.grid import plan
 from sb3_follow_object.envs import (
     IDS,
     TASKS,

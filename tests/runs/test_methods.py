@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sb3_follow_object.comparison.grid import needs_object_stage, stage_settings
+from sb3_follow_object.comparison.cells import needs_object_stage, stage_settings
 from sb3_follow_object.object_stage.networks import FILE, ObjectNetworks
 from sb3_follow_object.runs.checkpoints import checkpoint_files
 from sb3_follow_object.runs.experiment import train

@@ -1,0 +1,110 @@
+"""The grid file: what a folder of results was compared with, and which of its runs failed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ..common.files import atomic_write
+from ..runs.run_folder import difference
+from .cells import Cell, Settings
+
+GRID = "grid.json"
+ATTEMPTS = 2  # a run that failed is taken up again once
+_FORMAT = 1
+
+
+class Ledger:
+    """The grid file: the settings, the cells that were ever asked for, and their failures.
+
+    Args:
+        folder: of the results; is created.
+        settings: of all runs, which `plan` has checked.
+        cells: the runs that are wanted now; those of the file stay.
+        retry_failed: forget earlier failures of these cells.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: Settings,
+        cells: Iterable[Cell],
+        retry_failed: bool = False,
+    ):
+        folder.mkdir(parents=True, exist_ok=True)
+        self._path = folder / GRID
+        self._content = read_grid(folder) or {"format": _FORMAT, **_plain(settings), "cells": {}}
+        self.cells: dict[str, dict[str, Any]] = self._content["cells"]
+        for cell in cells:
+            row = {"task": cell.task, "method": cell.method, "seed": cell.seed}
+            entry = self.cells.setdefault(cell.name, {**row, "failures": 0, "error": None})
+            if retry_failed:
+                entry |= {"failures": 0, "error": None}
+        self._write()
+
+    def failed(self, name: str) -> bool:
+        """Whether a cell has used up its attempts."""
+        return bool(self.cells[name]["failures"] >= ATTEMPTS)
+
+    def note_failure(self, name: str, error: str, final: bool = False) -> None:
+        """Count a failure of a cell; a final one uses up its attempts."""
+        entry = self.cells[name]
+        entry["failures"] = ATTEMPTS if final else entry["failures"] + 1
+        entry["error"] = error
+        self._write()
+
+    def note_success(self, name: str) -> None:
+        """Forget a cell's failure: the second attempt came through."""
+        if self.cells[name]["failures"]:
+            self.cells[name] |= {"failures": 0, "error": None}
+            self._write()
+
+    def _write(self) -> None:
+        atomic_write(self._path, json.dumps(self._content, indent=1).encode())
+
+
+def read_grid(folder: Path) -> dict[str, Any] | None:
+    """Return the grid file's content, None where the folder has no such file.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    path = folder / GRID
+    if not path.exists():
+        return None
+    try:
+        content = json.loads(path.read_text())
+        if content["format"] != _FORMAT:
+            raise ValueError(f"its format is {content['format']!r}, not {_FORMAT}")
+        for cell in content["cells"].values():
+            str(cell["task"]), str(cell["method"]), int(cell["seed"]), int(cell["failures"])
+            str(cell["error"])
+    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is not the file of a comparison's grid ({error})") from error
+    return dict(content)
+
+
+def check_settings(folder: Path, settings: Settings) -> None:
+    """Raise a ValueError where a folder's runs were compared with other settings."""
+    kept = read_grid(folder)
+    if kept is None:
+        return
+    wanted = _plain(settings)
+    different = difference({name: kept.get(name) for name in wanted}, wanted)
+    if different is not None:
+        name, old, new = different
+        raise ValueError(
+            f"{folder} was compared with {name} {old!r}, not {new!r}; use the same settings or "
+            "another folder"
+        )
+
+
+def _plain(settings: Settings) -> dict[str, Any]:
+    return {
+        "steps": settings.steps,
+        "preset": settings.preset,
+        "set": dict(settings.overrides or {}),
+        "paper_evaluation": settings.paper_evaluation,
+    }
