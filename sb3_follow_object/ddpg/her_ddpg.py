@@ -338,8 +338,10 @@ class HerDDPG(KeptDDPG):
         self.policy.update_average(decay if self.average_decay > 0.0 else 0.0)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, value in zip(COLUMNS, th.cat(told).nanmean(dim=0).tolist(), strict=True):
-            self.logger.record(f"train/{name}", value)
+        means = th.cat(told).nanmean(dim=0).tolist()
+        for name, value in zip(COLUMNS, means, strict=True):
+            if self.policy_delay == 1 or value == value:  # else the actor's turn did not come
+                self.logger.record(f"train/{name}", value)
         for name, mean in (auxiliary.take_log() if auxiliary else {}).items():
             self.logger.record(name, mean)
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer):

@@ -177,6 +177,27 @@ def test_target_networks_move_once_an_interval() -> None:
     assert all(th.equal(a, b) for a, b in zip(live, target, strict=True))
 
 
+def test_the_actor_learns_once_in_so_many_updates_and_the_critic_in_each() -> None:
+    model = make_model(policy_delay=3)
+    model.learn(600, log_interval=None)  # type: ignore[arg-type]
+    model._n_updates = 0
+
+    def weights(network: th.nn.Module) -> th.Tensor:
+        return th.cat([w.detach().flatten().clone() for w in network.parameters()])
+
+    moved = []
+    for _ in range(6):
+        actor, critic = weights(model.actor.mu), weights(model.critic)
+        model.logger.name_to_value.clear()
+        model.train(1, 64)
+        assert not th.equal(critic, weights(model.critic))
+        moved.append(not th.equal(actor, weights(model.actor.mu)))
+        assert ("train/actor_loss" in model.logger.name_to_value) == moved[-1]
+    assert moved == [False, False, True] * 2
+    model.train(3, 64)
+    assert np.isfinite(model.logger.name_to_value["train/actor_loss"])
+
+
 def test_episodes_of_several_environments() -> None:
     env = make_vec("FetchReach-v4", 2, seed=0)
     tiny = {"gradient_steps": 1, "batch_size": 8, "buffer_size": 1000}
