@@ -175,8 +175,8 @@ def test_run_folder_resumes_and_is_evaluated_again(
         total_timesteps=3600,
         settings=settings,
         eval_every=400,
-        n_eval_episodes=38,
-        n_final_episodes=38,
+        n_eval_episodes=8,
+        n_final_episodes=8,
         checkpoint_minutes=1e-9,
     )
     whole = train(config, tmp_path / "whole", report=lambda sentence: None)
@@ -199,7 +199,7 @@ def test_run_folder_resumes_and_is_evaluated_again(
         return [[v for i, v in enumerate(row.split(",")) if i != column] for row in rows]
 
     assert without_wall("part") == without_wall("whole")
-    again = evaluate(tmp_path / "part" / "policy.safetensors", ENV, 38)
+    again = evaluate(tmp_path / "part" / "policy.safetensors", ENV, 8)
     assert again.success_rate == resumed["success_rate"]
 
     with pytest.raises(ValueError, match="is not empty"):
@@ -260,7 +260,7 @@ def test_streams_of_a_run_are_unrelated() -> None:
 @pytest.mark.parametrize("method", ["her", "shaped"])
 def test_preset_learns_what_the_run_folder_learns(method: str, tmp_path: Path) -> None:
     small = {"n_envs": 2, "n_threads": 1, "batch_size": 16, "gradient_steps": 2}
-    small |= {"learning_starts": 200, "policy_kwargs.net_arch": [8]}
+    small |= {"buffer_size": 2000, "learning_starts": 200, "policy_kwargs.net_arch": [8]}
     config = run_config(ENV, method=method, seed=5, overrides=small)
     train(replace(config, total_timesteps=600, n_final_episodes=1), tmp_path / "run", report=print)
     run = FollowObject.from_preset(ENV, method=method, seed=5, overrides=small)

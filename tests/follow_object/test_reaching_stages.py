@@ -105,7 +105,7 @@ def test_tests_of_h_max_know_nothing_of_it(predictor: GoalPredictor) -> None:
 
 
 def test_run_folder_stopped_in_the_robots_stage_resumes_exactly(tmp_path: Path) -> None:
-    config = runs.config(settings={"reach": REACH}, eval_every=10**6)
+    config = runs.config(settings={"reach": REACH}, eval_every=10**6, total_timesteps=2800)
     runs.run(tmp_path / "whole", config=config)
 
     def interrupt(figures: dict[str, Any]) -> None:
