@@ -23,6 +23,7 @@ N_SUBSTEPS = 20  # of 0.002 s each: one env step is 0.04 s
 OBJECT = "object0"  # body, site and geom
 TABLE = "table0"
 TUBE = "tube"
+OBSTACLE = "obstacle"
 GRIP_SITE = "robot0:grip"
 # Right, then left, as in the observation.
 FINGER_JOINTS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
@@ -127,7 +128,7 @@ def fetch_spec(task: Task) -> mujoco.MjSpec:
     spec = mujoco.MjSpec.from_file(str(_assets() / "fetch" / file))
     table = _child(spec.worldbody.bodies, TABLE)
     table.geoms[0].name = TABLE
-    _add_boxes(table, "obstacle", task.obstacles)
+    _add_boxes(table, OBSTACLE, task.obstacles)
     if task.tube:
         tube = spec.worldbody.add_body(name=TUBE, mocap=True, pos=_TUBE_STORE)
         _add_boxes(tube, TUBE, task.tube)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.reports import Trouble, reason
+from . import demo
 from .cli_options import CURVE, IMAGINED, PROGRAM, TASK, USER_ERROR, VIDEO, make_parser
 from .streams import leave_streams, open_streams
 
@@ -339,6 +340,7 @@ _COMMANDS = {
     "compare": _compare,
     "predictor": _predictor,
     "settings": _settings,
+    "demo": demo.run,
 }
 
 if __name__ == "__main__":

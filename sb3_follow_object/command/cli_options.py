@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..settings.methods import METHODS
+from . import demo
 
 # Nothing heavier here: --help must not wait for torch.
 
@@ -58,6 +59,7 @@ def make_parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
     """
     parser = Parser(prog=PROGRAM, description="Follow the Object for Stable-Baselines3.")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+    demo.add_parser(subparsers)
     _add_train(subparsers)
     _add_about_runs(subparsers)
     _add_compare(subparsers)
