@@ -56,7 +56,7 @@ settings: $(INSTALLED)
 $(INSTALLED): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install -c constraints.txt torch setuptools wheel
-	$(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[zoo,plots,video,ray,test]'
+	$(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[zoo,plots,video,ray,onnx,test]'
 	touch $@
 
 clean:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.reports import Trouble, reason
-from . import demo
+from . import demo, export
 from .cli_options import CURVE, IMAGINED, PROGRAM, TASK, USER_ERROR, VIDEO, make_parser
 from .streams import leave_streams, open_streams
 
@@ -341,6 +341,7 @@ _COMMANDS = {
     "predictor": _predictor,
     "settings": _settings,
     "demo": demo.run,
+    "export": export.run,
 }
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..settings.methods import METHODS
-from . import demo
+from . import demo, export
 
 # Nothing heavier here: --help must not wait for torch.
 
@@ -63,6 +63,7 @@ def make_parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
     _add_train(subparsers)
     _add_about_runs(subparsers)
     _add_compare(subparsers)
+    export.add_parser(subparsers)
 
     predictor = subparsers.add_parser("predictor", help="learn F_phi alone, stages one and two")
     predictor.set_defaults(method="fo")
