@@ -11,7 +11,7 @@ from .common.old_names import keep_old_names
 from .common.providers import provide
 from .envs import register_envs, register_task
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from .callbacks.curriculum_callback import CurriculumCallback as CurriculumCallback

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..settings.methods import METHODS
-from . import demo, export
+from . import completion, demo, export, picture, report
 
 # Nothing heavier here: --help must not wait for torch.
 
@@ -63,6 +63,8 @@ def make_parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
     _add_train(subparsers)
     _add_about_runs(subparsers)
     _add_compare(subparsers)
+    report.add_parser(subparsers)
+    picture.add_parser(subparsers)
     export.add_parser(subparsers)
 
     predictor = subparsers.add_parser("predictor", help="learn F_phi alone, stages one and two")
@@ -76,6 +78,7 @@ def make_parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
     )
     for name, subparser in subparsers.choices.items():
         subparser.set_defaults(run_command=commands[name])
+    completion.add_shell_options(parser)
     return parser
 
 

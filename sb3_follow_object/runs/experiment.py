@@ -43,6 +43,7 @@ from .run_folder import (
     noted_command,
     take_steps,
 )
+from .tensorboard_page import describe_curves
 
 # Evaluation copies: the paper's 380 episodes are ten from each.
 _EVAL_COPIES = 38
@@ -331,6 +332,7 @@ def _logger(folder: Path, env_steps: int, report: Report) -> Logger:
         import tensorboard  # noqa: F401
 
         formats.append(make_output_format("tensorboard", str(folder), suffix))
+        describe_curves(formats[-1].writer)  # type: ignore[attr-defined]
     except ModuleNotFoundError:
         pass
     except Exception as error:  # it drags in much that may not fit together
