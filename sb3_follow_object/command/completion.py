@@ -23,7 +23,7 @@ def add_shell_options(parser: argparse.ArgumentParser) -> None:
     shtab.add_argument_to(parser, help="print what makes this shell complete the command's words")
     for action in _actions(parser):
         if action.type is Path:
-            action.complete = shtab.FILE  # type: ignore[attr-defined]
+            action.complete = shtab.FILE
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[Any]:

@@ -131,7 +131,7 @@ def _episode(policy_file: Any, env_id: str, seed: int) -> tuple[list[np.ndarray]
         obs, info = env.reset(seed=seed)
         frames, over = [frame(env)], False
         while not over:
-            action, _ = actor.predict(obs, deterministic=True)  # type: ignore[arg-type]
+            action, _ = actor.predict(obs, deterministic=True)
             obs, _, terminated, truncated, info = env.step(action)
             frames.append(frame(env))
             over = terminated or truncated
@@ -176,7 +176,7 @@ def _object_frames(env_id: str, path: np.ndarray, seed: int) -> list[np.ndarray]
         obs, _ = env.reset(seed=seed)
         frames = [frame(env)]
         for target in path[1:]:
-            action = np.zeros(env.action_space.shape, np.float32)  # type: ignore[arg-type]
+            action = np.zeros(env.action_space.shape or (), np.float32)
             pull = (target - obs["achieved_goal"]) / MAX_DISPLACEMENT
             action[:3] = np.clip(pull, -1.0, 1.0)
             obs, *_ = env.step(action)

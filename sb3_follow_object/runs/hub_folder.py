@@ -120,7 +120,7 @@ def load_hub_folder(folder: str | os.PathLike[str]) -> tuple[Actor, RunConfig]:
     env = make_vec(config.env_id, 1)
     try:
         space = env.observation_space
-        return load_actor(folder / POLICY, space, env.action_space)[0], config  # type: ignore[arg-type]
+        return load_actor(folder / POLICY, space, env.action_space)[0], config
     finally:
         env.close()
 
