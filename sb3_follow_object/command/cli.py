@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..common.reports import Trouble, reason
 from . import demo, export, picture, report
-from .cli_options import CURVE, IMAGINED, PROGRAM, TASK, USER_ERROR, VIDEO, make_parser
+from .cli_options import PROGRAM, USER_ERROR, make_parser
+from .picture_names import CURVE, IMAGINED, TASK, VIDEO
 from .streams import leave_streams, open_streams
 
 # Nothing heavier here: --help must not wait for torch. The commands import what they use.

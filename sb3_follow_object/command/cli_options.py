@@ -11,12 +11,12 @@ from typing import Any, NoReturn
 
 from ..settings.methods import METHODS
 from . import completion, demo, export, picture, report
+from .picture_names import CURVE, VIDEO
 
 # Nothing heavier here: --help must not wait for torch.
 
 PROGRAM = "sb3-follow-object"
 USER_ERROR = 2
-CURVE, TASK, IMAGINED, VIDEO = "curve.png", "task.png", "imagined.png", "video.mp4"
 
 
 class Parser(argparse.ArgumentParser):

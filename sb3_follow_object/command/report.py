@@ -44,7 +44,7 @@ def _pictures(run: Path, drawn: Path) -> dict[str, Path]:
     from ..runs.object_stage_files import PREDICTOR
     from ..runs.run_folder import POLICY
     from ..settings.presets import load_config
-    from .cli_options import IMAGINED, VIDEO
+    from .picture_names import IMAGINED, VIDEO
     from .pictures import draw_imagined, record
 
     env_id = load_config(run).env_id
