@@ -1,5 +1,8 @@
 # Every target works on a bare machine: it makes $(VENV) from $(PYTHON) first when it is not there.
-PYTHON ?= python3.11
+# The one that the pins were tested with comes first, then what there is of 3.10 or newer.
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3.14 python3.10 python3; do \
+	$$p -c 'import sys, venv; sys.exit(sys.version_info < (3, 10))' 2>/dev/null && echo $$p && break; \
+	done)
 VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
@@ -59,9 +62,11 @@ settings: $(INSTALLED)
 
 # torch goes first and by its pin: a range would let pip fetch a newer build with CUDA.
 $(INSTALLED): pyproject.toml constraints.txt
+	@test -x $(BIN)/python || test -n "$(PYTHON)" || \
+		{ echo "no Python of 3.10 or newer with venv is on PATH: make PYTHON=/path/to/python"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install -c constraints.txt torch setuptools wheel
-	$(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[zoo,plots,video,ray,docs,test]'
+	$(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[zoo,plots,video,ray,docs,onnx,test]'
 	touch $@
 
 clean:

@@ -9,6 +9,7 @@ from gymnasium import spaces
 
 from ..common.suggestions import did_you_mean
 from .registration import import_task
+from .robotics import check_robotics
 from .task_table import IDS
 
 _GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -27,6 +28,7 @@ def check_task(env_id: str) -> str:
         raise ValueError(f"there is no environment {env_id!r}{near}")
     if name in IDS:
         return name
+    check_robotics(name)
     try:
         env = gym.make(name)
     except Exception as error:  # an environment of somebody's may raise anything

@@ -13,6 +13,7 @@ from ..common.suggestions import did_you_mean
 from .fetch import FetchVecEnv
 from .object_locomotion import ObjectVecEnv
 from .registration import import_task
+from .robotics import check_robotics
 from .scene import physics_digest
 from .task_table import IDS, lookup
 
@@ -39,6 +40,7 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
             raise ValueError(f"{env_id!r} cannot be made: {error}") from error
         return face(name, n_envs, n_threads, **options)
 
+    check_robotics(name)
     n_envs = checked_whole("n_envs", n_envs, 1)
     seed = options.pop("seed", None)
     try:

@@ -12,18 +12,25 @@ import numpy as np
 from .batch import BatchedSimulation
 from .graphics import check_windows, open_graphics
 from .physics_engine import mujoco
-from .scene import OBJECT, Scene, delete, fetch_spec, object_only
+from .scene import OBJECT, OBSTACLE, TUBE, Scene, delete, fetch_spec, object_only
 from .tasks import SUCCESS_DISTANCE, Region, reference_point
 
 SIZE = 480  # pixels, both ways
-_LOOK_AT = (1.3, 0.75, 0.5)
-_DISTANCE, _AZIMUTH, _ELEVATION = 1.7, 132.0, -25.0
+# From before the table, the robot behind it: starts lie on the left of most tasks and goals on the
+# right, and the arm comes from behind, so that it hides little of the way between them.
+_LOOK_AT = (1.3, 0.75, 0.54)
+_DISTANCE, _AZIMUTH, _ELEVATION = 1.4, 183.0, -32.0
+_BACKGROUND = ((0.98, 0.98, 0.99), (0.85, 0.88, 0.93))  # the sky's two colours
+_OBSTACLE_ALPHA = 0.5  # what is in or behind them is seen through them
+_ROBOT_ALPHA = 0.3  # while markers are shown, which may stand behind it
 _OBJECT_RGBA = (0.95, 0.65, 0.1, 1.0)
 _GOAL_RGBA = (0.9, 0.1, 0.1, 0.8)
 _START_REGION_RGBA = (0.1, 0.4, 0.9, 0.15)
 _GOAL_REGION_RGBA = (0.9, 0.2, 0.1, 0.12)
-_MARKER_RGBA = (0.1, 0.7, 0.2, 0.6)
+# Markers from the first to the last, as the levels 1 .. T of imagined goals.
+_MARKER_RGB = np.array([(0.27, 0.0, 0.33), (0.13, 0.57, 0.55), (0.99, 0.85, 0.15)])
 _RADIUS = 0.4 * SUCCESS_DISTANCE
+_MARKER_RADIUS = 0.25 * SUCCESS_DISTANCE
 _THIN = 0.002  # half the least thickness of a drawn region, metres
 
 
@@ -47,7 +54,9 @@ class Picture:
         return {**vars(self), "_canvas": None, "_window": None}
 
     def set_markers(self, points: np.ndarray) -> None:
-        """Points (n, 3) in metres to draw from now on.
+        """Points (n, 3) in metres to draw from now on, coloured from first to last.
+
+        The robot is transparent where there are any.
 
         Raises:
             ValueError: the shape is another one.
@@ -67,7 +76,7 @@ class Picture:
         _check_process()
         if self._canvas is None:
             self._canvas = _Canvas(whole_model(self._scene))
-        self._canvas.show(simulation, index)
+        self._canvas.show(simulation, index, see_through=len(self._markers) > 0)
         self._add_shapes(self._canvas.scene, simulation.goals[index])
         return self._canvas.pixels()
 
@@ -99,8 +108,9 @@ class Picture:
 
     def _add_shapes(self, scene: Any, goal: np.ndarray) -> None:
         sphere, box = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX
-        for point in self._markers:
-            _add_shape(scene, sphere, point, np.full(3, _RADIUS), _MARKER_RGBA)
+        colours = marker_colours(len(self._markers))
+        for point, rgb in zip(self._markers, colours, strict=True):
+            _add_shape(scene, sphere, point, np.full(3, _MARKER_RADIUS), (*rgb, 1.0))
         _add_shape(scene, sphere, goal, np.full(3, _RADIUS), _GOAL_RGBA)
         if self._show_regions:
             task, rest = self._scene.task, self._scene.landmarks.rest_height
@@ -117,6 +127,13 @@ class Picture:
         low = np.array([*(reference + region.low), bottom])
         high = np.array([*(reference + region.high), top])
         return (low + high) / 2, np.maximum((high - low) / 2, _THIN)
+
+
+def marker_colours(n: int) -> np.ndarray:
+    """Colours (n, 3) in [0, 1] of n markers: dark violet first, yellow last."""
+    share = np.linspace(0.0, 1.0, n)
+    stops = np.linspace(0.0, 1.0, len(_MARKER_RGB))
+    return np.stack([np.interp(share, stops, part) for part in _MARKER_RGB.T], axis=-1)
 
 
 _drawn_by: int | None = None  # the first process that drew, among this one and its parents
@@ -148,15 +165,20 @@ class _Canvas:
         self._pen = _pen(model)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._pen)
         self.scene = mujoco.MjvScene(model, maxgeom=2000)
+        bodies = [model.body(body).name for body in model.geom_bodyid]
+        self._of_robot = np.array([name.startswith("robot0:") for name in bodies])
         _point(self._camera)
 
-    def show(self, simulation: BatchedSimulation, index: int) -> None:
-        """Put the state of a copy into the drawn scene."""
+    def show(self, simulation: BatchedSimulation, index: int, see_through: bool) -> None:
+        """Put the state of a copy into the drawn scene, with `see_through` a transparent robot."""
         _copy_state(simulation, index, self._model, self._data)
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(
             self._model, self._data, self._option, None, self._camera, everything, self.scene
         )
+        for geom in self.scene.geoms[: self.scene.ngeom] if see_through else ():
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and self._of_robot[geom.objid]:
+                geom.rgba[3] = _ROBOT_ALPHA
 
     def pixels(self) -> np.ndarray:
         """The drawn scene, row 0 at the top."""
@@ -202,6 +224,12 @@ def whole_model(scene: Scene) -> mujoco.MjModel:
     delete(spec, next(b for b in spec.worldbody.bodies if b.name == "robot0:mocap").geoms)
     (cube,) = (geom for geom in spec.geoms if geom.name == OBJECT)
     cube.material, cube.rgba = "", _OBJECT_RGBA
+    for geom in spec.geoms:
+        if geom.name.startswith((OBSTACLE, TUBE)):
+            geom.rgba[3] = _OBSTACLE_ALPHA
+    for texture in spec.textures:
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            texture.rgb1, texture.rgb2 = _BACKGROUND
     return (object_only(spec, OBJECT) if scene.alone else spec).compile()
 
 

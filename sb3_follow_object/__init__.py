@@ -11,7 +11,7 @@ from .common.old_names import keep_old_names
 from .common.providers import provide
 from .envs import register_envs, register_task
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from .callbacks.curriculum_callback import CurriculumCallback as CurriculumCallback
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .ddpg.actor_files import save_actor as save_actor
     from .ddpg.auxiliary import AuxiliaryReward as AuxiliaryReward
     from .ddpg.her_ddpg import HerDDPG as HerDDPG
+    from .ddpg.onnx_files import export_onnx as export_onnx
     from .ddpg.policies import HerPolicy as HerPolicy
     from .envs import make_vec as make_vec
     from .follow_object.follow_object import FollowObject as FollowObject
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from .replay.her_replay_buffer import FollowObjectReplayBuffer as FollowObjectReplayBuffer
     from .runs.evaluation import evaluate as evaluate
     from .runs.experiment import train as train
+    from .runs.hub_folder import load_hub_folder as load_hub_folder
+    from .runs.hub_folder import write_hub_folder as write_hub_folder
     from .runs.predictor_cache import get_object_networks as get_object_networks
     from .runs.predictor_cache import get_predictor as get_predictor
     from .settings.presets import preset_file as preset_file
@@ -58,14 +61,17 @@ _HOME = {
     "ReachFirstWrapper": "reach.wrapper",
     "RunConfig": "settings.run_config",
     "evaluate": "runs.evaluation",
+    "export_onnx": "ddpg.onnx_files",
     "get_object_networks": "runs.predictor_cache",
     "get_predictor": "runs.predictor_cache",
     "load_actor": "ddpg.actor_files",
+    "load_hub_folder": "runs.hub_folder",
     "make_vec": "envs.make",
     "preset_file": "settings.presets",
     "run_config": "settings.presets",
     "save_actor": "ddpg.actor_files",
     "train": "runs.experiment",
+    "write_hub_folder": "runs.hub_folder",
 }
 
 __all__ = [*_HOME, "register_envs", "register_task"]

@@ -73,20 +73,21 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def bare_python(wheel: Path) -> Callable[..., Path]:
     """Makes an environment with the wheel in it; what it depends on is seen through a path file.
 
-    Packages named beside the folder are downloaded and come before the ones seen through the path.
+    Packages named beside the folder are downloaded, with what they need that the path lacks, and
+    come before the ones seen through it.
     """
 
     def make(folder: Path, *packages: str) -> Path:
         venv.create(folder, with_pip=False, symlinks=True)
         python = folder / "bin" / "python"
-        pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-deps"]
-        run([*pip, "--no-index", str(wheel)])
-        if packages:
-            run([*pip, *packages])
+        pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q"]
+        run([*pip, "--no-deps", "--no-index", str(wheel)])
         (own,) = folder.glob("lib/python*/site-packages")
         # A folder that a .pth names does not have its own .pth files read, so the editable install
         # of this tree stays out of sight.
         (own / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+        if packages:
+            run([*pip, "--upgrade", *packages])
         return python
 
     return make

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.reports import Trouble, reason
-from .cli_options import CURVE, IMAGINED, PROGRAM, TASK, USER_ERROR, VIDEO, make_parser
+from . import demo, export, picture, report
+from .cli_options import PROGRAM, USER_ERROR, make_parser
+from .picture_names import CURVE, IMAGINED, TASK, VIDEO
 from .streams import leave_streams, open_streams
 
 # Nothing heavier here: --help must not wait for torch. The commands import what they use.
@@ -113,6 +115,7 @@ def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> Non
     def draw(name: str) -> None:
         from ..comparison.plots import draw_curves
         from ..imagination.goal_predictor import GoalPredictor
+        from .films import add_film
         from .pictures import draw_imagined, draw_task, record
 
         out = run / name
@@ -124,6 +127,7 @@ def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> Non
             draw_imagined(env_id, GoalPredictor.load(run / PREDICTOR, env_id=env_id), out)
         else:
             record(run / POLICY, env_id, out)
+            add_film(run, env_id)
 
     failed: dict[str, list[str]] = {}
     for name in (CURVE, TASK, IMAGINED, VIDEO):
@@ -340,6 +344,10 @@ _COMMANDS = {
     "compare": _compare,
     "predictor": _predictor,
     "settings": _settings,
+    "demo": demo.run,
+    "export": export.run,
+    "report": report.run,
+    "picture": picture.run,
 }
 
 if __name__ == "__main__":

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..settings.methods import METHODS
+from . import completion, demo, export, picture, report
+from .picture_names import CURVE, VIDEO
 
 # Nothing heavier here: --help must not wait for torch.
 
 PROGRAM = "sb3-follow-object"
 USER_ERROR = 2
-CURVE, TASK, IMAGINED, VIDEO = "curve.png", "task.png", "imagined.png", "video.mp4"
 
 
 class Parser(argparse.ArgumentParser):
@@ -58,9 +59,13 @@ def make_parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
     """
     parser = Parser(prog=PROGRAM, description="Follow the Object for Stable-Baselines3.")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+    demo.add_parser(subparsers)
     _add_train(subparsers)
     _add_about_runs(subparsers)
     _add_compare(subparsers)
+    report.add_parser(subparsers)
+    picture.add_parser(subparsers)
+    export.add_parser(subparsers)
 
     predictor = subparsers.add_parser("predictor", help="learn F_phi alone, stages one and two")
     predictor.set_defaults(method="fo")
@@ -73,6 +78,7 @@ def make_parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
     )
     for name, subparser in subparsers.choices.items():
         subparser.set_defaults(run_command=commands[name])
+    completion.add_shell_options(parser)
     return parser
 
 

@@ -1,9 +1,10 @@
-"""Pictures and videos of a task, its imagined goals and a trained robot."""
+"""Pictures and films of a task, its imagined goals and a trained robot."""
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,21 @@ import numpy as np
 from ..common.extras import need
 from ..common.files import atomic_write
 from ..ddpg.actor_files import load_actor
-from ..envs import IDS
+from ..envs import IDS, TASKS
 from ..envs.graphics import find_graphics
 from ..imagination.goal_predictor import GoalPredictor
+from ..imagination.imagined_goals import points_along
 
-# Episodes side by side in the picture of imagined goals.
+# Episodes side by side in the picture of imagined goals, and tasks in a row of all tasks.
 _PANELS = 3
+_TASKS_IN_A_ROW = 4
+# Imagined goals in pictures: shares of the way, as the levels of a curriculum "path".
+_LEVELS = 25
+_INK = (30, 35, 50)
+_LETTERS = 22  # pixels
+
+EachStep = Callable[[gym.Env], None]
+EachEpisode = Callable[[int, bool], None]
 
 
 def draw_task(env_id: str, out: str | os.PathLike[str], seed: int = 0) -> None:
@@ -33,18 +43,44 @@ def draw_task(env_id: str, out: str | os.PathLike[str], seed: int = 0) -> None:
         MissingExtra: imageio is not installed.
         RuntimeError: there is nothing to draw with.
     """
-    env = _make(env_id, show_regions=True)
+    env = make_drawn(env_id, show_regions=True)
     try:
         env.reset(seed=seed)
-        _write_png(out, _frame(env))
+        _write_png(out, frame(env))
     finally:
         env.close()
+
+
+def draw_tasks(out: str | os.PathLike[str], seed: int = 0) -> None:
+    """Write a picture of the paper's eight tasks side by side, each with its name and regions.
+
+    Args:
+        out: PNG file to create or replace.
+        seed: of the starts and goals in it.
+
+    Raises:
+        MissingExtra: imageio is not installed.
+        RuntimeError: there is nothing to draw with.
+    """
+    panels = []
+    for name in TASKS:
+        env = make_drawn(f"FollowObject/{name}-v0", show_regions=True)
+        try:
+            env.reset(seed=seed)
+            panels.append(labelled(frame(env), name))
+        finally:
+            env.close()
+    panels += [np.full_like(panels[0], 255)] * (-len(panels) % _TASKS_IN_A_ROW)
+    rows = [panels[i : i + _TASKS_IN_A_ROW] for i in range(0, len(panels), _TASKS_IN_A_ROW)]
+    _write_png(out, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
 
 
 def draw_imagined(
     env_id: str, predictor: GoalPredictor, out: str | os.PathLike[str], seed: int = 0
 ) -> None:
-    """Write a picture of imagined goals h_1 .. h_T in a few episodes (paper, section 4.2).
+    """Write a picture of imagined goals in a few episodes (paper, section 4.2).
+
+    The goals lie evenly along the way that F_phi imagines, the first levels dark, the last yellow.
 
     Args:
         env_id: a task of this package.
@@ -56,17 +92,23 @@ def draw_imagined(
         MissingExtra: imageio is not installed.
         RuntimeError: there is nothing to draw with.
     """
-    env = _make(env_id)
+    env = make_drawn(env_id)
     try:
         panels = []
         for panel in range(_PANELS):
             obs, _ = env.reset(seed=seed + panel)
-            path = predictor.paths(obs["achieved_goal"][None], obs["desired_goal"][None])[0]
-            env.unwrapped.set_markers(path[1:])  # type: ignore[attr-defined]
-            panels.append(_frame(env))
+            env.unwrapped.set_markers(imagined_way(predictor, obs))  # type: ignore[attr-defined]
+            panels.append(frame(env))
         _write_png(out, np.concatenate(panels, axis=1))
     finally:
         env.close()
+
+
+def imagined_way(predictor: GoalPredictor, obs: dict[str, np.ndarray]) -> np.ndarray:
+    """Imagined goals (25, 3), evenly along the way from where an episode begins to its goal."""
+    paths = predictor.paths(obs["achieved_goal"][None], obs["desired_goal"][None])
+    way: np.ndarray = points_along(paths, np.arange(1, _LEVELS + 1) / _LEVELS)[0]
+    return way
 
 
 def record(
@@ -75,6 +117,7 @@ def record(
     out: str | os.PathLike[str],
     n_episodes: int = 5,
     seed: int = 0,
+    each_episode: EachEpisode = lambda episode, success: None,
 ) -> float:
     """Write a video of noise-free episodes with original goals; return their success rate.
 
@@ -84,45 +127,80 @@ def record(
         out: MP4 file to create or replace.
         n_episodes: at least 1.
         seed: of the first episode, at least 0.
+        each_episode: called with an episode's number, from 0, and its success.
 
     Raises:
         MissingExtra: imageio or its ffmpeg is not installed.
         RuntimeError: there is nothing to draw with.
         ValueError: no episodes are asked for, a negative seed, or the policy does not fit the task.
     """
-    if n_episodes < 1:
-        raise ValueError(f"episodes is {n_episodes}; it must be at least 1")
-    if seed < 0:
-        raise ValueError(f"seed is {seed}; it must be at least 0")
+    check_counts(n_episodes, seed)
     imageio = need("imageio", "video")
     need("imageio_ffmpeg", "video")
     out = Path(out)
-    env = _make(env_id)
+    env = make_drawn(env_id)
     # The writer knows the format by the ending; a name of its own keeps half a video apart.
     temporary = out.with_name(f".{out.stem}.{os.getpid()}.mp4")
     try:
         _check_can_write(temporary, out)
         actor, _ = load_actor(policy_file, env.observation_space, env.action_space)  # type: ignore[arg-type]
-        successes = 0
-        with imageio.get_writer(temporary, fps=env.metadata.get("render_fps", 25)) as video:
-            for episode in range(n_episodes):
-                obs, info = env.reset(seed=seed + episode)
-                video.append_data(_frame(env))
-                over = False
-                while not over:
-                    action, _ = actor.predict(obs, deterministic=True)
-                    obs, _, terminated, truncated, info = env.step(action)
-                    video.append_data(_frame(env))
-                    over = terminated or truncated
-                successes += bool(info["is_success"])
+        fps = env.metadata.get("render_fps", 25)
+        with imageio.get_writer(temporary, fps=fps) as video:
+
+            def film(env: gym.Env) -> None:
+                video.append_data(frame(env))
+
+            rate = play(actor, env, n_episodes, seed, film, each_episode)
         os.replace(temporary, out)
-        return successes / n_episodes
+        return rate
     finally:
         temporary.unlink(missing_ok=True)
         env.close()
 
 
-def _make(env_id: str, **options: Any) -> gym.Env:
+def play(
+    actor: Any,
+    env: gym.Env,
+    n_episodes: int,
+    seed: int,
+    each_step: EachStep,
+    each_episode: EachEpisode,
+) -> float:
+    """Play noise-free episodes and return their success rate.
+
+    Args:
+        actor: has SB3's `predict`.
+        env: the task.
+        n_episodes: at least 1.
+        seed: of the first episode.
+        each_step: called with the environment after each reset and step.
+        each_episode: called with an episode's number, from 0, and its success.
+    """
+    successes = 0
+    for episode in range(n_episodes):
+        obs, info = env.reset(seed=seed + episode)
+        each_step(env)
+        over = False
+        while not over:
+            action, _ = actor.predict(obs, deterministic=True)
+            obs, _, terminated, truncated, info = env.step(action)
+            each_step(env)
+            over = terminated or truncated
+        successes += bool(info["is_success"])
+        each_episode(episode, bool(info["is_success"]))
+    return successes / n_episodes
+
+
+def check_counts(n_episodes: int, seed: int) -> None:
+    """Raise a ValueError unless there are episodes and their seeds are not negative."""
+    if n_episodes < 1:
+        raise ValueError(f"episodes is {n_episodes}; it must be at least 1")
+    if seed < 0:
+        raise ValueError(f"seed is {seed}; it must be at least 0")
+
+
+def make_drawn(env_id: str, **options: Any) -> gym.Env:
+    """Make an environment whose `render` returns pictures."""
     if env_id in IDS:
         return gym.make(env_id, render_mode="rgb_array", **options)
     if sys.platform == "linux":
@@ -132,7 +210,8 @@ def _make(env_id: str, **options: Any) -> gym.Env:
     return gym.make(env_id, render_mode="rgb_array")
 
 
-def _frame(env: gym.Env) -> np.ndarray:
+def frame(env: gym.Env) -> np.ndarray:
+    """Draw an environment; one error says whatever keeps it from being drawn."""
     try:
         return np.asarray(env.render(), dtype=np.uint8)
     except (RuntimeError, ValueError):
@@ -141,6 +220,14 @@ def _frame(env: gym.Env) -> np.ndarray:
         raise RuntimeError(
             f"the task cannot be drawn here: {type(error).__name__}: {error}"
         ) from error
+
+
+def labelled(image: np.ndarray, text: str) -> np.ndarray:
+    """Write a line of text into the upper left corner of a picture (height, width, 3)."""
+    pil = need("PIL.Image", "video").fromarray(image)
+    font = need("PIL.ImageFont", "video").load_default(_LETTERS)
+    need("PIL.ImageDraw", "video").Draw(pil).text((10, 8), text, fill=_INK, font=font)
+    return np.asarray(pil)
 
 
 def _check_can_write(temporary: Path, out: Path) -> None:

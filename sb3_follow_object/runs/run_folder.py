@@ -60,20 +60,20 @@ def check_same_run(folder: Path, config: RunConfig) -> None:
 
 def difference(kept: dict[str, Any], wanted: dict[str, Any]) -> tuple[str, Any, Any] | None:
     """Return the first setting that differs, by its dotted name, and its two values."""
-    ours, theirs = (_flat(json.loads(json.dumps(settings))) for settings in (kept, wanted))
+    ours, theirs = (flat(json.loads(json.dumps(settings))) for settings in (kept, wanted))
     for name in {**ours, **theirs}:
         if ours.get(name) != theirs.get(name):
             return name, ours.get(name), theirs.get(name)
     return None
 
 
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested settings by their dotted names."""
-    flat: dict[str, Any] = {}
+    named: dict[str, Any] = {}
     for name, value in tree.items():
-        nested = _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else None
-        flat |= {f"{prefix}{name}": value} if nested is None else nested
-    return flat
+        nested = flat(value, f"{prefix}{name}.") if isinstance(value, dict) else None
+        named |= {f"{prefix}{name}": value} if nested is None else nested
+    return named
 
 
 def claim(folder: Path, config: RunConfig, command: str = "") -> None:

@@ -24,6 +24,7 @@ from .evaluation import evaluate, evaluation_env
 from .object_stage_files import load_object_stage, save_object_stage
 from .run_callbacks import CheckpointCallback, Progress, RunCallback, Solved, StopSignals
 from .run_folder import CROSS_TESTS, EVALUATIONS, POLICY, RESULT, noted_command
+from .tensorboard_page import describe_curves
 
 
 class RunStages:
@@ -219,6 +220,7 @@ def _logger(folder: Path, env_steps: int, report: Report) -> Logger:
         import tensorboard  # noqa: F401
 
         formats.append(make_output_format("tensorboard", str(folder), suffix))
+        describe_curves(formats[-1].writer)  # type: ignore[attr-defined]
     except ModuleNotFoundError:
         pass
     except Exception as error:  # it drags in much that may not fit together

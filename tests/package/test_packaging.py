@@ -43,7 +43,14 @@ def test_wheel_holds_every_file_of_the_tree_under_one_name(wheel: Path) -> None:
     expected = {
         f"{package}/{file.relative_to(folder).as_posix()}"
         for package, folder in PACKAGES.items()
-        for pattern in ("**/*.py", "**/*.yml", "**/*.xml", "**/py.typed")
+        for pattern in (
+            "**/*.py",
+            "**/*.yml",
+            "**/*.xml",
+            "**/*.html",
+            "**/*.safetensors",
+            "**/py.typed",
+        )
         for file in folder.glob(pattern)
     }
     assert shipped == expected
