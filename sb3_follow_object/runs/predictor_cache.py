@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 
+from ..common.cache import CACHE_VARIABLE as CACHE_VARIABLE
+from ..common.cache import SET_THE_VARIABLE, cache_folder
 from ..common.files import lock
 from ..common.reports import Report
 from ..envs import physics_id
@@ -20,8 +21,6 @@ from ..settings.presets import run_config
 from ..settings.run_config import RunConfig
 
 _FILES = (FACTS_FILE, OBJECT_FILE)
-CACHE_VARIABLE = "SB3_FOLLOW_OBJECT_CACHE"
-_SET_THE_VARIABLE = f"set {CACHE_VARIABLE} to a folder that can be written"
 
 
 def get_predictor(
@@ -73,7 +72,7 @@ def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report:
         except OSError as error:
             raise ValueError(
                 f"{path} holds no {name} and cannot be written ({error.strerror or error}); "
-                + ("give another folder" if folder is not None else _SET_THE_VARIABLE)
+                + ("give another folder" if folder is not None else SET_THE_VARIABLE)
             ) from error
         if not (path / name).exists():
             other = next((file for file in _FILES if (path / file).exists()), None)
@@ -100,30 +99,3 @@ def learn_predictor(
     if not (Path(folder) / OBJECT_FILE).exists():
         run.object_stage.networks.save(Path(folder) / OBJECT_FILE)
     return predictor
-
-
-def cache_folder() -> Path:
-    """Return the folder that predictors are kept in; it need not exist.
-
-    Raises:
-        ValueError: there is no home folder to find it in.
-    """
-    given = os.environ.get(CACHE_VARIABLE, "")
-    try:
-        if given.strip():
-            return Path(given).expanduser()
-        return _users_cache() / "sb3_follow_object"
-    except RuntimeError as error:
-        where = f"{CACHE_VARIABLE} is {given!r}, but " if given.strip() else ""
-        raise ValueError(
-            f"{where}there is no home folder to keep predictors in; {_SET_THE_VARIABLE}"
-        ) from error
-
-
-def _users_cache() -> Path:
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home())
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return given if given.is_absolute() else Path.home() / ".cache"  # as its specification says
