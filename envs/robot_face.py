@@ -10,12 +10,11 @@ import numpy as np
 from gymnasium import spaces
 
 from ..common.answers import one_each, one_number
-from .goal_envs import missing_goal_keys
+from .goal_envs import SUCCESS_METHODS, missing_goal_keys
 
 Judge = Callable[..., Any]
 GoalOf = Callable[[gym.Env, Any], tuple[Any, Any]]
 
-SUCCESS_METHODS = ("is_success", "_is_success")  # ours, and gymnasium-robotics'
 POSITION = 3
 _FAR = 10.0  # metres, farther than any goal is reached from
 
@@ -126,7 +125,7 @@ class RobotTask(gym.Wrapper):
         """Find who says whether goals are reached, and whether of many at once."""
         judge = self._given or _success_method(self.env)
         pays = None
-        if self.env.has_wrapper_attr("compute_reward") and self._goal is None:
+        if _has(self.env, "compute_reward") and self._goal is None:
             pays = rewards_on_and_off(self.env, desired)
             self.shifted = pays == (1.0, 0.0)
             if pays != (0.0, -1.0) and not self.shifted:
@@ -154,7 +153,7 @@ class RobotTask(gym.Wrapper):
 
 def needs_face(env: gym.Env) -> bool:
     """Whether an environment, which is reset and stepped, lacks what `RobotTask` adds."""
-    if missing_goal_keys(env.observation_space) or not env.has_wrapper_attr("compute_reward"):
+    if missing_goal_keys(env.observation_space) or not _has(env, "compute_reward"):
         return True
     success, reward = _success_method(env), env.get_wrapper_attr("compute_reward")
     if success is None:
@@ -180,10 +179,14 @@ def rewards_on_and_off(env: gym.Env, desired: np.ndarray) -> tuple[float, float]
 
 def _success_method(env: gym.Env) -> Judge | None:
     for name in SUCCESS_METHODS:
-        if env.has_wrapper_attr(name):
+        if _has(env, name):
             method: Judge = env.get_wrapper_attr(name)
             return method
     return None
+
+
+def _has(env: gym.Env, name: str) -> bool:
+    return env.has_wrapper_attr(name) and callable(env.get_wrapper_attr(name))
 
 
 def _answers_batches(judge: Judge, desired: np.ndarray) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import gymnasium as gym
@@ -14,9 +13,11 @@ from ..common.cache import SET_THE_VARIABLE, cache_folder
 from ..common.files import lock
 from ..common.numbers import checked_whole
 from ..common.reports import Report
+from ..envs.goal_envs import missing_goal_keys
 from ..envs.physics_engine import mujoco
 from ..envs.registration import import_task
-from ..envs.robot_face import POSITION, RobotTask, needs_face, rewards_on_and_off
+from ..envs.robot_copies import robot_maker
+from ..envs.robot_face import POSITION, RobotTask, rewards_on_and_off
 from .finding import Candidate, Observed, candidates, find_effector, find_object, observe
 from .resets import Resets, record_resets, varying_bodies
 from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of
@@ -88,14 +89,6 @@ def derived(env_id: str, report: Report = lambda sentence: None) -> Derived:
 _LOOKED_AT: dict[Any, Derived] = {}
 
 
-def make_robot(env_id: str, **options: Any) -> gym.Env:
-    """Make one environment as gymnasium does, with what it lacks of goals, rewards and success."""
-    env = gym.make(env_id, **options)
-    if _needs_face(env_id):
-        return RobotTask(env, object=_named_object(env))
-    return env
-
-
 def object_horizon(horizon: int) -> int:
     """T of the object's episodes where the robot's have this one.
 
@@ -104,18 +97,9 @@ def object_horizon(horizon: int) -> int:
     return horizon if horizon <= _LONG else _LONG_T
 
 
-@lru_cache(maxsize=64)
-def _needs_face(env_id: str) -> bool:
-    env = gym.make(env_id)
-    try:
-        return needs_face(env)
-    finally:
-        env.close()
-
-
 def _look(env_id: str, report: Report) -> Derived:
     try:
-        env = make_robot(env_id)
+        env = robot_maker(env_id)()
     except ValueError:
         raise
     except Exception as error:  # an environment of somebody's may raise anything
@@ -129,6 +113,12 @@ def _look(env_id: str, report: Report) -> Derived:
 
 
 def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
+    missing = missing_goal_keys(env.observation_space)
+    if missing:
+        raise ValueError(
+            f"there are no goals: its observations lack {', '.join(missing)}; say with goal= and "
+            "is_success= what is achieved, what is desired and when that is reached"
+        )
     horizon = _horizon(env)
     shape = env.observation_space["desired_goal"].shape  # type: ignore[index]
     if shape != (POSITION,):

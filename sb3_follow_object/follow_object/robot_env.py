@@ -8,7 +8,8 @@ from typing import Any
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..common.seeds import stream_seed
-from ..envs import IDS, make_vec
+from ..envs import IDS
+from ..envs.robot_copies import robot_vec_env
 
 
 def robot_env(settings: Mapping[str, Any], purpose: str) -> VecEnv:
@@ -22,6 +23,6 @@ def robot_env(settings: Mapping[str, Any], purpose: str) -> VecEnv:
     # Environments of others need not know the word; theirs are sparse unless asked.
     ours = settings["env_id"] in IDS
     options = {"reward_type": reward_type} if ours or reward_type != "sparse" else {}
-    env = make_vec(settings["env_id"], settings["n_envs"], settings["n_threads"], **options)
+    env = robot_vec_env(settings["env_id"], settings["n_envs"], settings["n_threads"], **options)
     env.seed(stream_seed(settings["seed"], purpose))
     return env

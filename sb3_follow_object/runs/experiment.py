@@ -23,7 +23,7 @@ from ..common.reports import Report, Trouble, reason
 from ..common.seeds import stream_seed
 from ..common.torch_helpers import threads_at
 from ..ddpg.actor_files import load_actor
-from ..envs import make_vec
+from ..envs.robot_copies import robot_vec_env
 from ..follow_object.follow_object import FollowObject
 from ..object_stage.policy import StopWhenSolved
 from ..settings.run_config import RunConfig
@@ -270,7 +270,7 @@ def _object_stage(
 
 def evaluation_env(env_id: str, seed: int | None = None, n_threads: int | None = None) -> VecEnv:
     """Return fresh copies of a task with its own goals and its sparse reward."""
-    env = make_vec(env_id, _EVAL_COPIES, n_threads)
+    env = robot_vec_env(env_id, _EVAL_COPIES, n_threads)
     env.seed(seed)
     return env
 

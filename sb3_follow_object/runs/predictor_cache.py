@@ -6,17 +6,16 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
+from ..any_task.tasks import physics_of_task, surface_choices
 from ..common.cache import CACHE_VARIABLE as CACHE_VARIABLE
 from ..common.cache import SET_THE_VARIABLE, cache_folder
 from ..common.files import lock
 from ..common.reports import Report
-from ..envs import physics_id
 from ..follow_object.follow_object import FollowObject
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.predictor_files import FACTS_FILE
 from ..object_stage.networks import FILE as OBJECT_FILE
 from ..object_stage.networks import ObjectNetworks
-from ..object_stage.policy import keeps_object_on_table
 from ..settings.presets import run_config
 from ..settings.run_config import RunConfig
 
@@ -40,8 +39,9 @@ def get_predictor(
             be written; or the id is not of this package.
     """
     path = _kept(FACTS_FILE, env_id, folder, report)
-    on_table = keeps_object_on_table(env_id)
-    physics = physics_id(env_id)
+    choices = surface_choices(env_id)
+    on_table = choices[0] if len(choices) == 1 else None  # else the object's learning has decided
+    physics = physics_of_task(env_id)
     return GoalPredictor.load(path.parent, env_id=env_id, physics=physics, object_on_table=on_table)
 
 
@@ -54,13 +54,13 @@ def get_object_networks(
         ValueError: as `get_predictor`; or the folder holds F_phi alone, which is not replaced.
     """
     path = _kept(OBJECT_FILE, env_id, folder, report)
-    return ObjectNetworks.load(path, env_id=env_id, physics=physics_id(env_id))
+    return ObjectNetworks.load(path, env_id=env_id, physics=physics_of_task(env_id))
 
 
 def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report: Report) -> Path:
     """Return a file of a task's first two stages, which run unless it is there already."""
     if folder is None:
-        path = cache_folder() / env_id / physics_id(env_id)
+        path = cache_folder() / env_id / physics_of_task(env_id)
     else:
         path = Path(folder).expanduser()
     if (path / name).exists():  # whole, since files take their names so: reading needs no lock

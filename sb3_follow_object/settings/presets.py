@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..any_task.tasks import check_followable, surface_choices
 from ..common.plain_yaml import load_yaml
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, object_id
@@ -24,6 +25,8 @@ from .sizes import check_sizes
 from .stages import ReachFirstSettings, ReachTeachingSettings, StageSettings, part_of_reach
 
 PRESETS = ("default", "paper")
+# The package's task that one of one's own is set up as, by whether its object is pushed.
+SIMILAR = {True: "FollowObject/PushSideGap-v0", False: "FollowObject/PnPSimpleV2-v0"}
 
 WRAPPER = "sb3_follow_object.ImaginedGoalWrapper"
 CALLBACK = "sb3_follow_object.CurriculumCallback"
@@ -91,13 +94,17 @@ def run_config(
     settings = _flattened(entry, path)
     has_object_stage = imagine or _auxiliary_name(settings) == "sldr"
     if has_object_stage and env_id not in IDS:
-        robots = sorted(name for name, (_, alone) in IDS.items() if not alone)
-        raise ValueError(
-            f"{env_id!r} has no environment of its object alone, which imagined goals and SLDR's "
-            f"reward come from; train it with --method her, or one of {', '.join(robots)}"
-        )
-    if has_object_stage and _find(entries, object_id(env_id)) is not None:
-        settings |= _object_stage(_entry(entries, object_id(env_id), path), path)
+        if _auxiliary_name(settings) == "sldr":
+            raise ValueError(
+                f"{env_id!r} is not a task of this package, whose observations alone SLDR's reward "
+                "can read the object's state from; train it with --method fo or her"
+            )
+        check_followable(env_id)
+        if env_id not in entries and surface_choices(env_id)[0]:
+            settings = _flattened(_entry(entries, SIMILAR[True], path), path)
+    of_object = object_id(env_id if env_id in IDS else SIMILAR[False])
+    if has_object_stage and _find(entries, of_object) is not None:
+        settings |= _object_stage(_entry(entries, of_object, path), path)
     changes: dict[str, Any] = {}
     for name, value in (overrides or {}).items():
         _override(changes, name, value)
@@ -221,7 +228,7 @@ def _find(entries: dict[str, Any], env_id: str) -> Any:
     """Return an id's entry; for a task of one's own, otherwise that of the most similar one."""
     if env_id not in entries and env_id in IDS and env_id not in BUILT_IN:
         task, alone = IDS[env_id]
-        env_id = f"FollowObject/{'PushSideGap' if task.blocked_gripper else 'PnPSimpleV2'}-v0"
+        env_id = SIMILAR[task.blocked_gripper]
         env_id = object_id(env_id) if alone else env_id
     return entries.get(env_id, entries.get(env_id.rpartition(":")[2]))
 
