@@ -36,7 +36,7 @@ def draw_task(env_id: str, out: str | os.PathLike[str], seed: int = 0) -> None:
     env = _make(env_id, show_regions=True)
     try:
         env.reset(seed=seed)
-        _write_png(out, _frame(env))
+        write_png(out, _frame(env))
     finally:
         env.close()
 
@@ -64,7 +64,7 @@ def draw_imagined(
             path = predictor.paths(obs["achieved_goal"][None], obs["desired_goal"][None])[0]
             env.unwrapped.set_markers(path[1:])  # type: ignore[attr-defined]
             panels.append(_frame(env))
-        _write_png(out, np.concatenate(panels, axis=1))
+        write_png(out, np.concatenate(panels, axis=1))
     finally:
         env.close()
 
@@ -152,7 +152,8 @@ def _check_can_write(temporary: Path, out: Path) -> None:
         raise
 
 
-def _write_png(out: str | os.PathLike[str], image: np.ndarray) -> None:
+def write_png(out: str | os.PathLike[str], image: np.ndarray) -> None:
+    """Write a picture as a whole or not at all."""
     need("imageio", "video")
     data = need("imageio.v3", "video").imwrite("<bytes>", image, extension=".png")
     atomic_write(out, data)
