@@ -19,6 +19,7 @@ from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
 from ..envs.robot_face import POSITION, RobotTask, rewards_on_and_off
 from .finding import Candidate, Observed, candidates, find_effector, find_object, observe
+from .physics_access import physics_of
 from .resets import Resets, record_resets, varying_bodies
 from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of
 
@@ -133,6 +134,11 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
     seen = observe(env)
     wanted = _named_object(env)
     found = find_object(seen, wanted)
+    if ends_at_goal(env, found.body):
+        raise ValueError(
+            "it ends its episodes at the goal; imagined goals need episodes that go on to their "
+            "time limit: turn that off in the environment"
+        )
     within = success_distance(env, few.goals[:5])
     drawn = _drawn(env_id, env, few, horizon, within)
     physics = physics_digest_of(model, found.body, found.offset, few, drawn)
@@ -179,6 +185,19 @@ def success_distance(env: gym.Env, goals: np.ndarray) -> float:
             f"than {_FARTHEST}"
         )
     return nearest
+
+
+def ends_at_goal(env: gym.Env, body: int) -> bool:
+    """Whether an episode is terminated once an object with a free joint is put on its goal."""
+    obs, _ = env.reset(seed=0)
+    model, data = physics_of(env)
+    joint = int(model.body_jntadr[body])
+    if int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_FREE):
+        return False
+    place = int(model.jnt_qposadr[joint])
+    data.qpos[place : place + 3] += obs["desired_goal"] - obs["achieved_goal"]
+    mujoco.mj_forward(model, data)
+    return bool(env.step(np.zeros_like(env.action_space.sample()))[2])
 
 
 def _horizon(env: gym.Env) -> int:

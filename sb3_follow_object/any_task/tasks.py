@@ -6,6 +6,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from ..common.reports import Report
 from ..envs import IDS, make_vec, object_id, physics_id
+from ..envs.tasks import SUCCESS_DISTANCE
 from .derived import derived, object_horizon
 from .simulation import DerivedObjectVecEnv
 
@@ -21,6 +22,30 @@ def check_followable(env_id: str, report: Report = lambda sentence: None) -> Non
     """
     if env_id not in IDS:
         derived(env_id, report)
+
+
+def what_is_followed(env_id: str) -> str:
+    """A sentence about what was found out of a task of others; "" for this package's own.
+
+    Raises:
+        ValueError: its object cannot be followed.
+    """
+    if env_id in IDS:
+        return ""
+    found = derived(env_id)
+    within = f"goals are reached within {found.success_distance * 1e3:.0f} mm"
+    shifted = "; rewards of 1 and 0 are shown as 0 and -1" if found.shifted else ""
+    unseen = f"; where {', '.join(found.varying)} stand is not seen" if found.varying else ""
+    return f"the object of {env_id} is {found.object.name}, {within}{shifted}{unseen}"
+
+
+def success_distance_of(env_id: str) -> float:
+    """Metres within which a task's goals are reached.
+
+    Raises:
+        ValueError: its object cannot be followed.
+    """
+    return SUCCESS_DISTANCE if env_id in IDS else derived(env_id).success_distance
 
 
 def physics_of_task(env_id: str) -> str:

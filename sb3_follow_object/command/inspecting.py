@@ -16,6 +16,8 @@ from ..common.reports import Report
 from ..envs import IDS
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
+from ..envs.scene_picture import draw_points
+from .pictures import write_png
 
 _SECONDS = 1.0  # that a speed is measured for
 _COPIES = 16
@@ -56,9 +58,6 @@ def draw_found(env_id: str, out: Path) -> None:
         MissingExtra: imageio is not installed.
         RuntimeError: there is nothing to draw with.
     """
-    from ..envs.scene_picture import draw_points
-    from .pictures import write_png
-
     found = derived(import_task(env_id))
     env = robot_maker(found.env_id)()
     try:

@@ -10,11 +10,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..any_task.physics_access import physics_of
 from ..common.extras import need
 from ..common.files import atomic_write
 from ..ddpg.actor_files import load_actor
 from ..envs import IDS
 from ..envs.graphics import find_graphics
+from ..envs.robot_copies import robot_maker
+from ..envs.scene_picture import draw_points
 from ..imagination.goal_predictor import GoalPredictor
 
 # Episodes side by side in the picture of imagined goals.
@@ -62,8 +65,11 @@ def draw_imagined(
         for panel in range(_PANELS):
             obs, _ = env.reset(seed=seed + panel)
             path = predictor.paths(obs["achieved_goal"][None], obs["desired_goal"][None])[0]
-            env.unwrapped.set_markers(path[1:])  # type: ignore[attr-defined]
-            panels.append(_frame(env))
+            if env_id in IDS:
+                env.unwrapped.set_markers(path[1:])  # type: ignore[attr-defined]
+                panels.append(_frame(env))
+            else:
+                panels.append(draw_points(*physics_of(env), path[1:], obs["desired_goal"][None]))
         write_png(out, np.concatenate(panels, axis=1))
     finally:
         env.close()
@@ -129,7 +135,7 @@ def _make(env_id: str, **options: Any) -> gym.Env:
         # Gymnasium's renderer takes the name as it stands, and without one tries a window first,
         # which ends a process without a screen.
         os.environ["MUJOCO_GL"] = find_graphics()
-    return gym.make(env_id, render_mode="rgb_array")
+    return robot_maker(env_id, render_mode="rgb_array")()
 
 
 def _frame(env: gym.Env) -> np.ndarray:

@@ -9,7 +9,13 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..any_task.tasks import SURFACE_STEPS, object_vec_env, physics_of_task, surface_choices
+from ..any_task.tasks import (
+    SURFACE_STEPS,
+    object_vec_env,
+    physics_of_task,
+    surface_choices,
+    what_is_followed,
+)
 from ..common.reports import Report
 from ..common.seeds import stream_seed
 from ..ddpg.her_ddpg import HerDDPG
@@ -103,6 +109,8 @@ class ObjectStage:
         """
         settings = self.settings
         self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
+        if sentence := what_is_followed(self.env_id):
+            self.report(f"  {sentence}")
         model, solved, spent = self._train(callback, state)
         self.steps = self.policy_steps = spent + model.num_timesteps
         if networks or self.needs_networks:

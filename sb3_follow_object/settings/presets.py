@@ -8,13 +8,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..any_task.tasks import check_followable, surface_choices
+from ..any_task.tasks import check_followable, success_distance_of, surface_choices
 from ..common.plain_yaml import load_yaml
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, object_id
 from ..envs.goal_envs import check_task
 from ..envs.registration import import_task
 from ..envs.task_table import BUILT_IN
+from ..envs.tasks import SUCCESS_DISTANCE
 from ..zoo_configs import FOLDER
 from .fields import Group, Setting, check_names, settings_of
 from .learning import AlgorithmSettings, check_auxiliary
@@ -25,6 +26,12 @@ from .sizes import check_sizes
 from .stages import ReachFirstSettings, ReachTeachingSettings, StageSettings, part_of_reach
 
 PRESETS = ("default", "paper")
+# Settings in metres that are meant as shares of the distance within which goals are reached.
+_TOLERANCES = (
+    ("curriculum", "min_distance"),
+    ("replay_buffer_kwargs", "moved_distance"),
+    ("replay_buffer_kwargs", "min_goal_distance"),
+)
 # The package's task that one of one's own is set up as, by whether its object is pushed.
 SIMILAR = {True: "FollowObject/PushSideGap-v0", False: "FollowObject/PnPSimpleV2-v0"}
 
@@ -100,8 +107,10 @@ def run_config(
                 "can read the object's state from; train it with --method fo or her"
             )
         check_followable(env_id)
-        if env_id not in entries and surface_choices(env_id)[0]:
-            settings = _flattened(_entry(entries, SIMILAR[True], path), path)
+        if env_id not in entries:  # set up as the package's most similar task
+            if surface_choices(env_id)[0]:
+                settings = _flattened(_entry(entries, SIMILAR[True], path), path)
+            _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
     of_object = object_id(env_id if env_id in IDS else SIMILAR[False])
     if has_object_stage and _find(entries, of_object) is not None:
         settings |= _object_stage(_entry(entries, of_object, path), path)
@@ -308,6 +317,14 @@ def _object_stage(entry: dict[str, Any], path: Path) -> dict[str, Any]:
     env_kwargs = algorithm.pop("env_kwargs", {})
     check_names(env_kwargs, ("on_table",), f"{path}: env_kwargs of the object")
     return settings | {f"object_{name}": value for name, value in env_kwargs.items()}
+
+
+def _scale_distances(settings: dict[str, Any], factor: float) -> None:
+    """Fit what presets say in metres to how near its goal an object must be."""
+    for outer, name in _TOLERANCES:
+        group = settings.get(outer)
+        if isinstance(group, dict) and name in group:
+            settings[outer] = {**group, name: round(group[name] * factor, 6)}
 
 
 def _override(settings: dict[str, Any], name: str, value: Any) -> None:
