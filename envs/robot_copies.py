@@ -60,7 +60,7 @@ def robot_vec_env(env_id: str, n_envs: int, n_threads: int | None = None, **opti
 
 def robot_maker(env_id: str, **options: Any) -> Callable[[], gym.Env]:
     """Return what makes one copy of a registered task, with what it lacks of `RobotTask`."""
-    spec = gym.spec(env_id)
+    spec = gym.spec(import_task(env_id))
     probe = gym.make(spec, **options)
     try:
         wrapped = may_be_faced(probe) and needs_face(probe)

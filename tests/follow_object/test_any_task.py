@@ -60,7 +60,7 @@ def test_an_object_that_does_not_learn_on_its_surface_may_leave_it(
         def _on_step(self) -> bool:
             return True
 
-        def _on_rollout_end(self) -> None:
+        def _on_rollout_start(self) -> None:
             states.append(copy.deepcopy(self.solved.state_dict()))
 
     said: list[str] = []
