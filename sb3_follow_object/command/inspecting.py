@@ -10,13 +10,12 @@ import gymnasium as gym
 import numpy as np
 
 from ..any_task.derived import Derived, derived
-from ..any_task.physics_access import physics_of
+from ..any_task.scene_picture import draw_points
 from ..any_task.simulation import DerivedObjectVecEnv
 from ..common.reports import Report
 from ..envs import IDS
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
-from ..envs.scene_picture import draw_points
 from .pictures import write_png
 
 _SECONDS = 1.0  # that a speed is measured for
@@ -63,7 +62,7 @@ def draw_found(env_id: str, out: Path) -> None:
     try:
         env.reset(seed=0)
         starts, goals = found.resets.starts[:_SHOWN], found.resets.goals[:_SHOWN]
-        write_png(out, draw_points(*physics_of(env), starts, goals))
+        write_png(out, draw_points(env, starts, goals))
     finally:
         env.close()
 

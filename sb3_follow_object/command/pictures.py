@@ -10,14 +10,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ..any_task.physics_access import physics_of
+from ..any_task.scene_picture import Drawn, draw_points
 from ..common.extras import need
 from ..common.files import atomic_write
 from ..ddpg.actor_files import load_actor
 from ..envs import IDS
 from ..envs.graphics import find_graphics
 from ..envs.robot_copies import robot_maker
-from ..envs.scene_picture import draw_points
 from ..imagination.goal_predictor import GoalPredictor
 
 # Episodes side by side in the picture of imagined goals.
@@ -69,7 +68,7 @@ def draw_imagined(
                 env.unwrapped.set_markers(path[1:])  # type: ignore[attr-defined]
                 panels.append(_frame(env))
             else:
-                panels.append(draw_points(*physics_of(env), path[1:], obs["desired_goal"][None]))
+                panels.append(draw_points(env, path[1:], obs["desired_goal"][None]))
         write_png(out, np.concatenate(panels, axis=1))
     finally:
         env.close()
@@ -135,6 +134,10 @@ def _make(env_id: str, **options: Any) -> gym.Env:
         # Gymnasium's renderer takes the name as it stands, and without one tries a window first,
         # which ends a process without a screen.
         os.environ["MUJOCO_GL"] = find_graphics()
+    plain = robot_maker(env_id)()
+    if "rgb_array" not in plain.metadata.get("render_modes", ()):
+        return Drawn(plain)
+    plain.close()
     return robot_maker(env_id, render_mode="rgb_array")()
 
 

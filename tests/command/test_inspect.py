@@ -10,6 +10,7 @@ import pytest
 from sb3_follow_object.any_task import derived as looking
 from sb3_follow_object.command import inspecting
 from sb3_follow_object.command.cli import main
+from sb3_follow_object.command.pictures import draw_task
 from sb3_follow_object.common.cache import CACHE_VARIABLE
 
 ARM = f"arm_and_wall:{arm_and_wall.ARM}"
@@ -62,3 +63,13 @@ def test_why_nothing_is_found_is_one_line(
     assert main(["inspect", "--env", env_id]) == 2
     told = capsys.readouterr()
     assert told.out == "" and told.err.count("\n") == 1 and sentence in told.err
+
+
+def test_an_environment_that_draws_nothing_is_filmed_all_the_same(
+    can_draw: None, tmp_path: Path
+) -> None:
+    imageio = pytest.importorskip("imageio.v3")
+    out = tmp_path / "task.png"
+    draw_task(ARM, out)
+    image = imageio.imread(out).astype(int)
+    assert image.shape == (480, 480, 3) and image.max() > 40
