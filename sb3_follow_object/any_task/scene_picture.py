@@ -91,11 +91,6 @@ class Drawn(gym.Wrapper):
         self._picture: ScenePicture | None = None
         self._goal = np.zeros(3)
 
-    @property
-    def render_mode(self) -> str:
-        """What `render` returns."""
-        return "rgb_array"
-
     def reset(self, **options: Any) -> Any:
         """Start an episode."""
         obs, info = self.env.reset(**options)

@@ -311,7 +311,8 @@ class FollowObject:
             return self
         callbacks: list[BaseCallback] = []
         if env_state(self.env) is None:
-            tests = self.curriculum_callback and self.curriculum_callback.test_env
+            testing = self.curriculum_callback
+            tests = None if testing is None else testing.test_env
             callbacks.append(FreshEpisodes(lambda n: stream_seed(self.seed, f"robot {n}"), tests))
         own = (self.reach_callback, self.curriculum_callback)
         callbacks += [each for each in own if each is not None]
