@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .make import physics_id as physics_id
     from .object_locomotion import ObjectEnv as ObjectEnv
     from .object_locomotion import ObjectVecEnv as ObjectVecEnv
+    from .robot_face import RobotTask as RobotTask
     from .scene import object_only as object_only
 
 _HOME = {
@@ -26,6 +27,7 @@ _HOME = {
     "FetchVecEnv": "fetch",
     "ObjectEnv": "object_locomotion",
     "ObjectVecEnv": "object_locomotion",
+    "RobotTask": "robot_face",
     "make_vec": "make",
     "object_only": "scene",
     "object_state": "fetch",

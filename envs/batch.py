@@ -14,7 +14,7 @@ import numpy as np
 from ..common.copies import WholeCopies
 from ..common.numbers import checked_whole
 from .physics_engine import mujoco
-from .scene import N_SUBSTEPS, OBJECT, TUBE, Scene, weld_targets
+from .scene import OBJECT, TUBE, Scene, weld_targets
 
 _LOGGER = logging.getLogger("sb3_follow_object")
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -76,13 +76,9 @@ class BatchedSimulation(WholeCopies):
         model = self.scene.model
         self._pool: ThreadPoolExecutor | None = None
         self._pool_process = 0
-        self.dt = model.opt.timestep * N_SUBSTEPS
+        self.dt = model.opt.timestep * self.scene.substeps
         self.data = [mujoco.MjData(model) for _ in range(self.n_envs)]
-        self._mocap, self._welded = weld_targets(model)
-        self._tube = int(model.body(TUBE).mocapid[0]) if self.scene.task.tube else None
-        self._object_qpos = int(model.joint(f"{OBJECT}:joint").qposadr[0])
-        self._object_qvel = int(model.joint(f"{OBJECT}:joint").dofadr[0])
-        self._object_site = int(model.site(OBJECT).id)
+        self._find(model)
 
         # What each copy shows after a step: name -> (n_envs, ...), and where it is read from.
         self.read: dict[str, np.ndarray] = {}
@@ -96,6 +92,14 @@ class BatchedSimulation(WholeCopies):
         self._no_warning = bytes(self._warnings[0].nbytes)
         self._mocap_pos = [d.mocap_pos[self._mocap] for d in self.data]
         self._mocap_quat = [d.mocap_quat[self._mocap] for d in self.data]
+
+    def _find(self, model: mujoco.MjModel) -> None:
+        """Find the ids of what is moved and read."""
+        self._mocap, self._welded = weld_targets(model)
+        self._tube = int(model.body(TUBE).mocapid[0]) if self.scene.task.tube else None
+        self._object_qpos = int(model.joint(f"{OBJECT}:joint").qposadr[0])
+        self._object_qvel = int(model.joint(f"{OBJECT}:joint").dofadr[0])
+        self._object_site = int(model.site(OBJECT).id)
 
     # What a subclass says -------------------------------------------------------------------------
 
@@ -114,20 +118,25 @@ class BatchedSimulation(WholeCopies):
 
     def reset(self, index: int, rng: np.random.Generator) -> None:
         """Start an episode in one copy: draw object and goal, forget the past."""
+        model, data = self.scene.model, self.data[index]
+        mujoco.mj_resetData(model, data)
+        self.goals[index] = self._place(index, rng)
+        self.steps[index] = 0
+        self.faults[index] = None
+        mujoco.mj_forward(model, data)
+        self.refresh(index)
+
+    def _place(self, index: int, rng: np.random.Generator) -> np.ndarray:
+        """Put the object where an episode begins and return its goal (3,), in metres."""
         scene, data = self.scene, self.data[index]
         start, goal = scene.task.sample(rng, scene.landmarks)
-        mujoco.mj_resetData(scene.model, data)
         data.time = scene.time
         data.qpos[:] = scene.qpos
         data.qvel[:] = scene.qvel
         data.qpos[self._object_qpos : self._object_qpos + 2] = start
         if self._tube is not None:
             data.mocap_pos[self._tube] = (goal[0], goal[1], self._table_top)
-        self.goals[index] = goal
-        self.steps[index] = 0
-        self.faults[index] = None
-        mujoco.mj_forward(scene.model, data)
-        self.refresh(index)
+        return goal
 
     def step(self, actions: np.ndarray) -> None:
         """Move all copies on by one env step of 0.04 s.
@@ -267,14 +276,14 @@ class BatchedSimulation(WholeCopies):
 
     def _drain(self, todo: Iterator[int]) -> None:
         # Threads share one range iterator: each takes the next copy, so uneven copies balance out.
-        model = self.scene.model
+        model, substeps = self.scene.model, self.scene.substeps
         for index in todo:
             if self.faults[index] is not None:
                 continue
             data = self.data[index]
             self._mocap_pos[index][...] = self._target_pos[index]
             self._mocap_quat[index][...] = self._target_quat[index]
-            mujoco.mj_step(model, data, N_SUBSTEPS)
+            mujoco.mj_step(model, data, substeps)
             self.after_substeps(index)
             if self._warnings[index].tobytes() != self._no_warning:  # in a tenth of any()'s time
                 self._note_fault(index)

@@ -19,7 +19,6 @@ from .batch import BatchedSimulation
 from .physics_engine import mujoco
 from .picture import Picture
 from .scene import Scene
-from .tasks import SUCCESS_DISTANCE
 
 let_vec_envs_be_copied()
 
@@ -69,16 +68,18 @@ class _GoalFace(WholeCopies):
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
         """Rewards (...) of achieved goals (..., 3) for desired ones (..., 3).
 
-        Sparse: 0 within 0.05 m, else -1. Dense: minus the distance in metres. `info` is unused.
+        Sparse: 0 within the scene's success distance (0.05 m in this package's own tasks), else -1.
+        Dense: minus the distance in metres. `info` is unused.
         """
         distance = _distance(achieved_goal, desired_goal)
         if self.reward_type == "dense":
             return -distance
-        return -(distance > SUCCESS_DISTANCE).astype(np.float32)
+        return -(distance > self.simulation.scene.success_distance).astype(np.float32)
 
     def is_success(self, achieved_goal: np.ndarray, desired_goal: np.ndarray) -> Any:
-        """Whether achieved goals (..., 3) lie within 0.05 m of desired ones, bool (...)."""
-        return _distance(achieved_goal, desired_goal) <= SUCCESS_DISTANCE
+        """Whether achieved goals (..., 3) lie that near to desired ones, bool (...)."""
+        within = self.simulation.scene.success_distance
+        return _distance(achieved_goal, desired_goal) <= within
 
     def set_markers(self, points: np.ndarray) -> None:
         """Points (n, 3) in metres that pictures show from now on, such as imagined goals."""

@@ -12,6 +12,7 @@ from .registration import import_task
 from .robotics import check_robotics
 from .task_table import IDS
 
+SUCCESS_METHODS = ("is_success", "_is_success")  # ours, and gymnasium-robotics'
 _GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
@@ -39,11 +40,17 @@ def check_task(env_id: str) -> str:
             raise ValueError(f"{env_id!r} has no goals: its observations lack {', '.join(missing)}")
         if env.spec is None or env.spec.max_episode_steps is None:
             raise ValueError(f"{env_id!r} does not say how long its episodes are")
-        if _hides_success(env):
+        if _hides_success(env) and not _judges(env):
             raise ValueError(f"{env_id!r} does not tell in its info whether the goal is reached")
     finally:
         env.close()
     return name
+
+
+def _judges(env: gym.Env) -> bool:
+    """Whether an environment can be asked whether a goal is reached."""
+    names = (*SUCCESS_METHODS, "compute_reward")
+    return any(env.has_wrapper_attr(n) and callable(env.get_wrapper_attr(n)) for n in names)
 
 
 def _hides_success(env: gym.Env) -> bool:

@@ -73,7 +73,7 @@ class Picture:
             RuntimeError: there is no graphics library to draw with, or the process was forked off
                 one that draws.
         """
-        _check_process()
+        check_process()
         if self._canvas is None:
             self._canvas = _Canvas(whole_model(self._scene))
         self._canvas.show(simulation, index, see_through=len(self._markers) > 0)
@@ -86,7 +86,7 @@ class Picture:
         Raises:
             RuntimeError: no window can be opened, or as for `draw`.
         """
-        _check_process()
+        check_process()
         if self._window is None:
             self._window = _Window(whole_model(self._scene))
         with self._window.viewer.lock():
@@ -139,7 +139,7 @@ def marker_colours(n: int) -> np.ndarray:
 _drawn_by: int | None = None  # the first process that drew, among this one and its parents
 
 
-def _check_process() -> None:
+def check_process() -> None:
     """Refuse to draw where a parent did: the threads that its graphics wait for are not here."""
     global _drawn_by
     if _drawn_by is None:
@@ -253,6 +253,11 @@ def _pen(model: mujoco.MjModel) -> mujoco.MjrContext:
 def _point(camera: Any) -> None:
     camera.lookat[:] = _LOOK_AT
     camera.distance, camera.azimuth, camera.elevation = _DISTANCE, _AZIMUTH, _ELEVATION
+
+
+def add_point(scene: Any, point: np.ndarray, radius: float, rgba: tuple[float, ...]) -> None:
+    """Put a ball into a scene that is being drawn; lengths in metres."""
+    _add_shape(scene, mujoco.mjtGeom.mjGEOM_SPHERE, point, np.full(3, radius), rgba)
 
 
 def _add_shape(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from .physics_engine import mujoco
-from .tasks import Box, Landmarks, Task
+from .tasks import SUCCESS_DISTANCE, Box, Landmarks, Task
 
 N_SUBSTEPS = 20  # of 0.002 s each: one env step is 0.04 s
 OBJECT = "object0"  # body, site and geom
@@ -79,6 +79,8 @@ class Scene:
         qvel: likewise, (nv,).
         time: simulated time at the start of an episode, in seconds.
         landmarks: points that the task's samplers refer to.
+        substeps: of the physics in an env step of 0.04 s.
+        success_distance: metres within which a goal is reached.
     """
 
     task: Task
@@ -88,6 +90,8 @@ class Scene:
     qvel: np.ndarray
     time: float
     landmarks: Landmarks
+    substeps: int = N_SUBSTEPS
+    success_distance: float = SUCCESS_DISTANCE
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
         return self

@@ -1,4 +1,4 @@
-"""The command `sb3-follow-object`: train, evaluate, watch, plot, compare, predictor, settings."""
+"""The command `sb3-follow-object` and what each of its commands runs."""
 
 from __future__ import annotations
 
@@ -311,6 +311,19 @@ def _predictor(args: argparse.Namespace) -> None:
     print(args.out)
 
 
+def _inspect(args: argparse.Namespace) -> None:
+    from .inspecting import draw_found, inspect
+
+    facts = inspect(args.env, _warn)
+    width = max(map(len, facts))
+    for name, words in facts.items():
+        print(f"{name:<{width}}  {words}")
+    if args.out is not None:
+        out = _named(args.out, ".png")
+        draw_found(args.env, out)
+        print(out)
+
+
 def _settings(args: argparse.Namespace) -> None:
     from ..settings.table import lines
 
@@ -343,6 +356,7 @@ _COMMANDS = {
     "plot": _plot,
     "compare": _compare,
     "predictor": _predictor,
+    "inspect": _inspect,
     "settings": _settings,
     "demo": demo.run,
     "export": export.run,

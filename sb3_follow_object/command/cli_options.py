@@ -72,6 +72,10 @@ def make_parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
     predictor.add_argument("--out", type=Path, required=True, metavar="FOLDER")
     _add_settings(predictor)
 
+    inspect = subparsers.add_parser("inspect", help="say what is found in a task of others")
+    inspect.add_argument("--env", required=True, metavar="ID", help="e.g. FetchPush-v4")
+    inspect.add_argument("--out", type=Path, metavar="FILE.png", help="draw starts and goals")
+
     settings = subparsers.add_parser("settings", help="list what --set can change")
     settings.add_argument(
         "name", nargs="?", metavar="NAME", help="one of them, or a group, e.g. curriculum"

@@ -11,11 +11,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..any_task.scene_picture import Drawn, draw_points
 from ..common.extras import need
 from ..common.files import atomic_write
 from ..ddpg.actor_files import load_actor
 from ..envs import IDS, TASKS
 from ..envs.graphics import find_graphics
+from ..envs.robot_copies import robot_maker
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.imagined_goals import points_along
 
@@ -46,7 +48,7 @@ def draw_task(env_id: str, out: str | os.PathLike[str], seed: int = 0) -> None:
     env = make_drawn(env_id, show_regions=True)
     try:
         env.reset(seed=seed)
-        _write_png(out, frame(env))
+        write_png(out, frame(env))
     finally:
         env.close()
 
@@ -72,7 +74,7 @@ def draw_tasks(out: str | os.PathLike[str], seed: int = 0) -> None:
             env.close()
     panels += [np.full_like(panels[0], 255)] * (-len(panels) % _TASKS_IN_A_ROW)
     rows = [panels[i : i + _TASKS_IN_A_ROW] for i in range(0, len(panels), _TASKS_IN_A_ROW)]
-    _write_png(out, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
+    write_png(out, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
 
 
 def draw_imagined(
@@ -97,9 +99,13 @@ def draw_imagined(
         panels = []
         for panel in range(_PANELS):
             obs, _ = env.reset(seed=seed + panel)
-            env.unwrapped.set_markers(imagined_way(predictor, obs))  # type: ignore[attr-defined]
-            panels.append(frame(env))
-        _write_png(out, np.concatenate(panels, axis=1))
+            way = imagined_way(predictor, obs)
+            if env_id in IDS:
+                env.unwrapped.set_markers(way)  # type: ignore[attr-defined]
+                panels.append(frame(env))
+            else:
+                panels.append(draw_points(env, way, obs["desired_goal"][None]))
+        write_png(out, np.concatenate(panels, axis=1))
     finally:
         env.close()
 
@@ -207,7 +213,11 @@ def make_drawn(env_id: str, **options: Any) -> gym.Env:
         # Gymnasium's renderer takes the name as it stands, and without one tries a window first,
         # which ends a process without a screen.
         os.environ["MUJOCO_GL"] = find_graphics()
-    return gym.make(env_id, render_mode="rgb_array")
+    plain = robot_maker(env_id)()
+    if "rgb_array" not in plain.metadata.get("render_modes", ()):
+        return Drawn(plain)
+    plain.close()
+    return robot_maker(env_id, render_mode="rgb_array")()
 
 
 def frame(env: gym.Env) -> np.ndarray:
@@ -239,7 +249,8 @@ def _check_can_write(temporary: Path, out: Path) -> None:
         raise
 
 
-def _write_png(out: str | os.PathLike[str], image: np.ndarray) -> None:
+def write_png(out: str | os.PathLike[str], image: np.ndarray) -> None:
+    """Write a picture as a whole or not at all."""
     need("imageio", "video")
     data = need("imageio.v3", "video").imwrite("<bytes>", image, extension=".png")
     atomic_write(out, data)

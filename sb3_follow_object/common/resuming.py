@@ -10,7 +10,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 
 def env_state(env: VecEnv) -> Any:
-    """Return the state of an environment that can tell it, else None."""
+    """Return the state of an environment that can tell it, else None.
+
+    What wraps one that cannot has a state that nothing goes on from.
+    """
+    if not hasattr(env.unwrapped, "get_state"):
+        return None
     return env.get_state() if hasattr(env, "get_state") else None
 
 

@@ -9,10 +9,11 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..any_task.tasks import effector_of, object_vec_env, steps_of_object
 from ..common.numbers import checked_whole
 from ..common.torch_helpers import usable_device
 from ..ddpg.her_ddpg import HerDDPG
-from ..envs import make_vec, object_id
+from ..envs import IDS
 from ..reach.approach import BEHIND, check_reachable, reach_first_settings
 from ..settings.fields import checked, settings_of
 from ..settings.learning import PredictorSettings
@@ -66,26 +67,66 @@ def check_algorithms(
         arguments["replay_buffer_kwargs"]["imagined_ratio"] = 0.0
     _check_algorithm(env, horizon, arguments)
     if settings["imagine"] or needs_networks:
-        object_env = make_vec(object_id(settings["env_id"]), 1)
+        env_id = settings["env_id"]
+        object_env, horizon = object_vec_env(env_id, 1), steps_of_object(env_id, horizon)
         _check_algorithm(object_env, horizon, copy.deepcopy(settings["object_algorithm"]))
         object_env.close()
 
 
-def reach_parts(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def reach_parts(
+    settings: Mapping[str, Any], on_table: bool | None = None
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the settings of reaching first, those of its wrapper and those of its callback.
 
     Args:
         settings: `FollowObject`'s.
+        on_table: whether the object's stage has kept it on its surface; None asks the settings.
     """
     reach = settings["reach"]
     # Where objects are kept on the table for the sake of pushing, the standoff is that of pushing.
-    if settings["object_on_table"] and reach.get("standoff", "auto") == "auto":
+    on_table = settings["object_on_table"] if on_table is None else on_table
+    if on_table and reach.get("standoff", "auto") == "auto":
         reach = {**reach, "standoff": BEHIND}
     first, teaching = (
         {name: value for name, value in reach.items() if name in settings_of(part)}
         for part in (ReachFirstSettings, ReachTeachingSettings)
     )
     return first, teaching
+
+
+def with_effector(reach: Any, env_id: str, imagine: bool) -> Any:
+    """Return the setting `reach` with the effector's place in the observation, where it is found.
+
+    Args:
+        reach: as given.
+        env_id: a task; of others' with imagined goals the physics says where the effector is told.
+        imagine: whether goals are imagined.
+
+    Raises:
+        ValueError: no part of the robot is told in the observation.
+    """
+    if not isinstance(reach, Mapping) or "effector" in reach or env_id in IDS or not imagine:
+        return reach
+    effector = effector_of(env_id)
+    if effector is None:
+        raise ValueError(
+            f"{env_id!r}: no part of the robot has its position in the observation; say with "
+            "reach.effector where the effector's is, or reach=null"
+        )
+    return {**reach, "effector": effector}
+
+
+def on_table_for(lift: object, on_table: bool | None) -> bool:
+    """Return the setting object_on_table that a setting `lift` other than "auto" means.
+
+    Raises:
+        ValueError: it is neither True nor False, or both are given.
+    """
+    if not isinstance(lift, bool):
+        raise ValueError(f'lift must be True, False or "auto", not {lift!r}')
+    if on_table is not None:
+        raise ValueError("lift and object_on_table say the same; give one of them")
+    return not lift
 
 
 def _check_algorithm(env: VecEnv, horizon: int, arguments: dict[str, Any]) -> None:

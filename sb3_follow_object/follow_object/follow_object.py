@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..any_task.registering import MakeEnv, registered
 from ..callbacks.curriculum_callback import CurriculumCallback
 from ..callbacks.reach_callback import ReachCallback
 from ..common.numbers import checked_whole
@@ -18,6 +19,7 @@ from ..common.reports import Report
 from ..ddpg.actor_files import save_actor
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs.goal_envs import known_id
+from ..envs.robot_face import GoalOf, Judge
 from ..imagination.curriculum import Curriculum
 from ..imagination.goal_predictor import GoalPredictor
 from ..object_stage.networks import FILE as OBJECT_FILE
@@ -27,7 +29,7 @@ from ..object_stage.stage import ObjectStage
 from ..settings.presets import run_config
 from ..settings.run_config import check_plain
 from ..settings.stages import StageSettings
-from .checks import check_algorithms, checked_settings
+from .checks import check_algorithms, checked_settings, on_table_for, with_effector
 from .robot_stage import RobotStage
 from .saved_folder import Saved, read, write
 
@@ -40,7 +42,16 @@ class FollowObject:
     imagines at growing distance.
 
     Args:
-        env_id: a task of this package, e.g. "FollowObject/PnPShelf-v0".
+        env_id: a task of this package, e.g. "FollowObject/PnPShelf-v0", or any goal environment on
+            MuJoCo that gymnasium knows, e.g. "FetchPickAndPlace-v4".
+        make_env: in place of an id, a function that makes such an environment.
+        object: name of the body that the goals are about; by default it is found.
+        goal: for environments without goals, a function of (env, observation) that returns the
+            achieved and the desired position, (3,) metres each.
+        is_success: likewise of (achieved, desired): whether the goal is reached.
+        lift: whether the object may leave its surface in the first stage; "auto" decides by the
+            heights of the goals, and by whether the object learns. The opposite of
+            `object_on_table`.
         imagine: False trains the robot on original goals only, i.e. DDPG + HER: no object stage.
         predictor: an F_phi made before for this task; skips the first two stages.
         object_networks: of an object stage made before for this task; needed beside `predictor`
@@ -80,8 +91,13 @@ class FollowObject:
 
     def __init__(
         self,
-        env_id: str,
+        env_id: str | None = None,
         *,
+        make_env: MakeEnv | None = None,
+        object: str | None = None,
+        goal: GoalOf | None = None,
+        is_success: Judge | None = None,
+        lift: bool | Literal["auto"] = "auto",
         imagine: bool = True,
         predictor: GoalPredictor | None = None,
         object_networks: ObjectNetworks | None = None,
@@ -107,14 +123,19 @@ class FollowObject:
         seed: int = 0,
         report: Report | None = None,
     ):
-        full_id, env_id = env_id, known_id(env_id)
+        full_id = registered(
+            env_id, make_env=make_env, object=object, goal=goal, is_success=is_success
+        )
+        env_id = known_id(full_id)
+        if lift != "auto":
+            object_on_table = on_table_for(lift, object_on_table)
         given = {
             "imagine": imagine,
             "n_envs": n_envs,
             "n_threads": n_threads,
             "reward_type": reward_type,
             "algorithm": algorithm or {},
-            **({} if reach is None else {"reach": reach}),
+            **({} if reach is None else {"reach": with_effector(reach, env_id, imagine)}),
             "curriculum": curriculum or {},
             "object_algorithm": object_algorithm or {},
             "object_on_table": object_on_table,
@@ -156,7 +177,7 @@ class FollowObject:
     @classmethod
     def from_preset(
         cls,
-        env_id: str,
+        env_id: str | None = None,
         *,
         method: str = "fo",
         preset: str = "default",
@@ -173,11 +194,15 @@ class FollowObject:
             seed: decides the whole run.
             overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win. Those
                 of a run folder (n_timesteps, eval_every and the like) mean nothing here.
-            **arguments: of the class, which are no settings: predictor, object_networks, report.
+            **arguments: of the class, which are no settings: predictor, object_networks, report,
+                make_env, object, goal, is_success, lift.
 
         Raises:
             ValueError: an id, a key or a value that cannot be meant, with the nearest that can.
         """
+        own = ("make_env", "object", "goal", "is_success")
+        given = {name: arguments.pop(name) for name in own if name in arguments}
+        env_id = registered(env_id, **given)
         config = run_config(env_id, method=method, preset=preset, seed=seed, overrides=overrides)
         return cls(env_id, seed=seed, **config.settings, **arguments)
 
@@ -257,6 +282,7 @@ class FollowObject:
         return self.robot_stage.begin(
             stage.predictor if self.imagine else None,
             stage.networks if stage.needs_networks else None,
+            stage.on_table,
         )
 
     def learn(
@@ -322,13 +348,23 @@ class FollowObject:
         write(Path(folder), Saved(settings, stage.predictor, stage.networks, state))
 
     @classmethod
-    def load(cls, folder: str | os.PathLike[str], report: Report | None = None) -> FollowObject:
+    def load(
+        cls, folder: str | os.PathLike[str], report: Report | None = None, **environment: Any
+    ) -> FollowObject:
         """Restore what `save` wrote; training goes on exactly where it stopped.
+
+        Args:
+            folder: that `save` was given.
+            report: as of the class.
+            **environment: env_id, make_env, object, goal and is_success as they were given, where
+                an id alone did not say it.
 
         Raises:
             ValueError: the folder holds no save, or one that is damaged.
         """
         folder = Path(folder)
+        if environment:
+            registered(**environment)
         try:
             saved = read(folder)
             run = cls(

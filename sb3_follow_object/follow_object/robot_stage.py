@@ -9,13 +9,15 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..any_task.tasks import steps_of_object
 from ..callbacks.curriculum_callback import CurriculumCallback
 from ..callbacks.fresh_episodes import FreshEpisodes, begin_new_episodes
 from ..callbacks.reach_callback import ReachCallback
 from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
 from ..common.seeds import stream_seed
 from ..ddpg.her_ddpg import HerDDPG
-from ..envs import IDS, make_vec
+from ..envs import IDS
+from ..envs.robot_copies import robot_vec_env
 from ..imagination.curriculum import Curriculum
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.vec_env import ImaginedGoalVecEnv
@@ -44,17 +46,24 @@ class RobotStage:
         self._seed: int = settings["seed"]
         self.env = self._copies("robot")
         self.horizon = int(self.env.get_attr("spec", indices=[0])[0].max_episode_steps)
-        self.curriculum = Curriculum(self.horizon, **settings["curriculum"])
+        steps = steps_of_object(settings["env_id"], self.horizon)
+        self.curriculum = Curriculum(steps, **settings["curriculum"])
         self.model: HerDDPG | None = None
         self.curriculum_callback: CurriculumCallback | None = None
         self.reach_callback: ReachCallback | None = None
 
-    def begin(self, predictor: GoalPredictor | None, networks: ObjectNetworks | None) -> HerDDPG:
+    def begin(
+        self,
+        predictor: GoalPredictor | None,
+        networks: ObjectNetworks | None,
+        on_table: bool | None = None,
+    ) -> HerDDPG:
         """Build what trains.
 
         Args:
             predictor: F_phi; None imagines no goals.
             networks: the object's, which SLDR's reward reads; None where it is not used.
+            on_table: whether the object's stage has kept it on its surface, where there was one.
         """
         arguments: dict[str, Any] = {"policy": "MultiInputPolicy", **self._settings["algorithm"]}
         if networks is not None:
@@ -62,7 +71,7 @@ class RobotStage:
         if predictor is not None:
             self._imagine(predictor)
         if self._settings.get("reach") is not None:
-            first, teaching = reach_parts(self._settings)
+            first, teaching = reach_parts(self._settings, on_table)
             self.env = ReachFirstVecEnv(self.env, **first)
             self.reach_callback = ReachCallback(stream_seed(self._seed, "reach"), **teaching)
         self.model = HerDDPG(env=self.env, seed=stream_seed(self._seed, "networks"), **arguments)
@@ -78,7 +87,9 @@ class RobotStage:
         """Train for more env steps, those of the curriculum's tests included."""
         callbacks: list[BaseCallback] = []
         if env_state(self.env) is None:
-            callbacks.append(FreshEpisodes(lambda n: stream_seed(self._seed, f"robot {n}")))
+            testing = self.curriculum_callback
+            tests = None if testing is None else testing.test_env
+            callbacks.append(FreshEpisodes(lambda n: stream_seed(self._seed, f"robot {n}"), tests))
         own = (self.reach_callback, self.curriculum_callback)
         callbacks += [each for each in own if each is not None]
         for each in callback if isinstance(callback, list) else [callback]:
@@ -156,6 +167,7 @@ class RobotStage:
         env_id, reward_type = self._settings["env_id"], self._settings["reward_type"]
         # Environments of others need not know the word; theirs are sparse unless asked.
         options = {"reward_type": reward_type} if env_id in IDS or reward_type != "sparse" else {}
-        env = make_vec(env_id, self._settings["n_envs"], self._settings["n_threads"], **options)
+        n_envs, n_threads = self._settings["n_envs"], self._settings["n_threads"]
+        env = robot_vec_env(env_id, n_envs, n_threads, **options)
         env.seed(stream_seed(self._seed, purpose))
         return env

@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..any_task.tasks import steps_of_object
 from ..common.answers import check_shape, one_number
 from ..common.copies import WholeCopies
 from ..common.providers import provider
@@ -184,6 +185,7 @@ def _curriculum(env: gym.Env, settings: Mapping[str, Any] | None) -> Curriculum:
             "give a Curriculum."
         )
     try:
-        return Curriculum(env.spec.max_episode_steps, **(settings or {}))
+        horizon = steps_of_object(env.spec.id, env.spec.max_episode_steps)
+        return Curriculum(horizon, **(settings or {}))
     except TypeError as error:
         raise ValueError(f"The curriculum cannot have these settings: {error}.") from error

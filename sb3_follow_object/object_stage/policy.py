@@ -10,11 +10,11 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..any_task.tasks import surface_choices
 from ..callbacks.copyable import CopyableCallback
 from ..callbacks.rollout import run_episodes
 from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
 from ..ddpg.her_ddpg import HerDDPG
-from ..envs import IDS
 from ..settings.stages import StageSettings
 
 
@@ -64,6 +64,7 @@ class StopWhenSolved(CopyableCallback):
         self.test_steps = 0
         self.stopped = False
         self._rollouts = 0
+        self.notes: dict[str, Any] = {}  # of whoever trains, kept with the state
 
     def _on_rollout_end(self) -> None:
         self._rollouts += 1
@@ -105,6 +106,7 @@ class StopWhenSolved(CopyableCallback):
             "test_steps": self.test_steps,
             "stopped": self.stopped,
             "rollouts": self._rollouts,
+            **({"notes": self.notes} if self.notes else {}),
         }
 
     def load_state_dict(self, state: dict[str, Any], model: HerDDPG, env: VecEnv) -> None:
@@ -118,6 +120,7 @@ class StopWhenSolved(CopyableCallback):
         self.rates = list(state["rates"])
         self.test_steps, self.stopped = state["test_steps"], state["stopped"]
         self._rollouts = state["rollouts"]
+        self.notes = dict(state.get("notes", {}))
 
 
 def train_object_policy(
@@ -167,13 +170,13 @@ def train_object_policy(
 
 
 def keeps_object_on_table(env_id: str, setting: bool | None = None) -> bool:
-    """Whether the object may not leave the table in the first stage.
+    """Whether the object may not leave the table in the first stage, as `surface_choices` begins.
 
     Args:
-        env_id: a task of this package.
-        setting: None decides by the task: yes where the gripper is blocked (Push tasks).
+        env_id: a task.
+        setting: None decides by the task.
     """
-    return IDS[env_id][0].blocked_gripper if setting is None else setting
+    return surface_choices(env_id, setting)[0]
 
 
 def collect_paths(model: Any, env: VecEnv, n_episodes: int) -> ObjectPaths:

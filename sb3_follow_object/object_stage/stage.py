@@ -6,19 +6,24 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
+from ..any_task.tasks import (
+    SURFACE_STEPS,
+    object_vec_env,
+    physics_of_task,
+    surface_choices,
+    what_is_followed,
+)
 from ..common.reports import Report
 from ..common.seeds import stream_seed
 from ..ddpg.her_ddpg import HerDDPG
-from ..envs import make_vec, object_id, physics_id
 from ..imagination.goal_predictor import GoalPredictor
 from .networks import ObjectNetworks
 from .policy import (
     StopWhenSolved,
     collect_paths,
-    keeps_object_on_table,
     train_object_policy,
 )
 
@@ -37,6 +42,7 @@ class ObjectStage:
         steps: env steps that both stages cost.
         policy_steps: those of the object policy alone, where it was learned here.
         success: share of the object's last noise-free episodes that ended on their goal.
+        on_table: whether the object may not leave the surface; decided once it has learned.
     """
 
     def __init__(
@@ -54,6 +60,7 @@ class ObjectStage:
         self.networks: ObjectNetworks | None = None
         self.steps = self.policy_steps = 0
         self.success = float("nan")
+        self.on_table: bool | None = None
 
     def use_predictor(self, predictor: GoalPredictor) -> None:
         """Take an F_phi that was made before.
@@ -62,17 +69,18 @@ class ObjectStage:
             ValueError: it was made for another task, for other physics, or from an object that
                 was kept on the table where this one's is not, or the other way round.
         """
-        if predictor.env_id != self.env_id or predictor.physics != physics_id(self.env_id):
+        if predictor.env_id != self.env_id or predictor.physics != physics_of_task(self.env_id):
             raise ValueError(
                 f"the predictor was made for {predictor.env_id} (physics {predictor.physics}), "
-                f"not for {self.env_id} (physics {physics_id(self.env_id)}); make a new one"
+                f"not for {self.env_id} (physics {physics_of_task(self.env_id)}); make a new one"
             )
-        on_table = self._on_table()
-        if predictor.object_on_table not in (None, on_table):
+        choices = self._choices()
+        if predictor.object_on_table not in (None, *choices):
             raise ValueError(
                 f"the predictor was made with object_on_table={predictor.object_on_table}, "
-                f"not {on_table}; make a new one"
+                f"not {choices[0]}; make a new one"
             )
+        self.on_table = predictor.object_on_table
         self.predictor = predictor
 
     def use_networks(self, networks: ObjectNetworks) -> None:
@@ -81,7 +89,7 @@ class ObjectStage:
         Raises:
             ValueError: they were made for another task or for other physics.
         """
-        networks.check(self.env_id, physics_id(self.env_id), "the object_networks given")
+        networks.check(self.env_id, physics_of_task(self.env_id), "the object_networks given")
         self.networks = networks
 
     def learn_policy(
@@ -101,34 +109,21 @@ class ObjectStage:
         """
         settings = self.settings
         self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
-        env, test_env = (self._env(name) for name in ("object", "object_test"))
-        model, solved = train_object_policy(
-            env,
-            test_env,
-            settings["object_timesteps"],
-            n_test_episodes=settings["object_test_episodes"],
-            test_every=settings["object_test_every"],
-            success_rate=settings["object_success"],
-            seed=stream_seed(self.seed, "object"),
-            report=lambda steps, rate: self.report(f"  {steps:>7} steps: success {rate:.2f}"),
-            callback=callback,
-            state=state,
-            **settings["object_algorithm"],
-        )
-        self.steps = self.policy_steps = model.num_timesteps
+        if sentence := what_is_followed(self.env_id):
+            self.report(f"  {sentence}")
+        model, solved, spent = self._train(callback, state)
+        self.steps = self.policy_steps = spent + model.num_timesteps
         if networks or self.needs_networks:
             self.networks = ObjectNetworks.learned(
                 model,
                 self.env_id,
-                physics_id(self.env_id),
+                physics_of_task(self.env_id),
                 seed=stream_seed(self.seed, "inverse"),
                 between_updates=between_epochs,
                 **settings["inverse_fit"],
             )
             error = self.networks.inverse_error
             self.report(f"  {self.steps} env steps, inverse model's error {error:.3f}")
-        env.close()
-        test_env.close()
         self.success = solved.rates[-1] if solved.rates else float("nan")
         return model, solved
 
@@ -163,8 +158,8 @@ class ObjectStage:
             paths.positions,
             paths.goals,
             env_id=self.env_id,
-            physics=physics_id(self.env_id),
-            object_on_table=self._on_table(),
+            physics=physics_of_task(self.env_id),
+            object_on_table=self.on_table,
             seed=stream_seed(self.seed, "predictor"),
             progress=lambda epoch, loss: between_epochs(),
             **{"device": str(model.device), **settings["predictor_fit"]},
@@ -172,15 +167,66 @@ class ObjectStage:
         self.report(f"  held-out error {float(np.mean(self.predictor.error_mm)):.1f} mm")
         return self.predictor
 
-    def _on_table(self) -> bool:
-        return keeps_object_on_table(self.env_id, self.settings["object_on_table"])
+    def _choices(self) -> tuple[bool, ...]:
+        """Whether the object stays on its surface, in the order of trial."""
+        return surface_choices(self.env_id, self.settings["object_on_table"])
+
+    def _train(
+        self,
+        callback: Callable[[StopWhenSolved], BaseCallback] | None,
+        state: dict[str, Any] | None,
+    ) -> tuple[HerDDPG, StopWhenSolved, int]:
+        """Train the object's policy, off its surface once it does not learn on it.
+
+        Returns:
+            The algorithm, the callback that tests it, and the env steps of trials that were given
+            up.
+        """
+        settings, choices = self.settings, self._choices()
+        if settings["object_timesteps"] <= SURFACE_STEPS:
+            choices = choices[:1]  # too few to tell
+        notes = {"trial": 0, "spent": 0} if state is None else state.get("notes", {})
+        spent: int = notes.get("spent", 0)
+        for trial in range(notes.get("trial", 0), len(choices)):
+            self.on_table = choices[trial]
+            last = trial == len(choices) - 1
+            total = settings["object_timesteps"]
+
+            def noting(
+                solved: StopWhenSolved, trial: int = trial, spent: int = spent
+            ) -> BaseCallback:
+                if trial:
+                    solved.notes = {"trial": trial, "spent": spent}
+                return CallbackList([]) if callback is None else callback(solved)
+
+            env, test_env = (self._env(name) for name in ("object", "object_test"))
+            model, solved = train_object_policy(
+                env,
+                test_env,
+                total if last else min(total, SURFACE_STEPS),
+                n_test_episodes=settings["object_test_episodes"],
+                test_every=settings["object_test_every"],
+                success_rate=settings["object_success"],
+                seed=stream_seed(self.seed, "object"),
+                report=lambda steps, rate: self.report(f"  {steps:>7} steps: success {rate:.2f}"),
+                callback=noting,
+                state=state,
+                **settings["object_algorithm"],
+            )
+            env.close()
+            test_env.close()
+            if solved.solved or last:
+                break
+            spent, state = spent + model.num_timesteps, None
+            self.report("  it does not learn on its surface: it may leave it from here on")
+        return model, solved, spent
 
     def _env(self, purpose: str) -> VecEnv:
-        env = make_vec(
-            object_id(self.env_id),
+        env = object_vec_env(
+            self.env_id,
             self.settings["object_n_envs"],
             self.settings["n_threads"],
-            on_table=self._on_table(),
+            on_table=bool(self.on_table),
         )
         env.seed(stream_seed(self.seed, purpose))
         return env

@@ -10,14 +10,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from ..callbacks.rollout import Episodes, run_episodes
 from ..common.seeds import stream_seed
 from ..ddpg.actor_files import load_actor
-from ..envs import make_vec
+from ..envs.robot_copies import robot_vec_env
 
 _COPIES = 38  # the paper's 380 episodes are ten from each
 
 
 def evaluation_env(env_id: str, seed: int | None = None, n_threads: int | None = None) -> VecEnv:
     """Return fresh copies of a task with its own goals and its sparse reward."""
-    env = make_vec(env_id, _COPIES, n_threads)
+    env = robot_vec_env(env_id, _COPIES, n_threads)
     env.seed(seed)
     return env
 

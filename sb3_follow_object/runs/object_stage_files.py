@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from ..any_task.tasks import physics_of_task
 from ..common.files import atomic_write
-from ..envs import physics_id
 from ..follow_object.follow_object import FollowObject
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.predictor_files import FACTS_FILE
@@ -67,7 +67,7 @@ def load_object_stage(folder: Path, run: FollowObject, saved: Any) -> float | No
     if run.imagine:
         stage.use_predictor(GoalPredictor.load(folder / PREDICTOR, env_id=run.env_id))
     if stage.needs_networks:
-        physics = physics_id(run.env_id)
+        physics = physics_of_task(run.env_id)
         stage.networks = ObjectNetworks.load(folder / OBJECT_FILE, run.env_id, physics)
     try:
         facts = json.loads(path.read_text())

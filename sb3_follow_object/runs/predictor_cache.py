@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import os
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 
+from ..any_task.tasks import physics_of_task, surface_choices
+from ..common.cache import CACHE_VARIABLE as CACHE_VARIABLE
+from ..common.cache import SET_THE_VARIABLE, cache_folder
 from ..common.files import lock
 from ..common.reports import Report
-from ..envs import physics_id
 from ..follow_object.follow_object import FollowObject
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.predictor_files import FACTS_FILE
 from ..object_stage.networks import FILE as OBJECT_FILE
 from ..object_stage.networks import ObjectNetworks
-from ..object_stage.policy import keeps_object_on_table
 from ..settings.presets import run_config
 from ..settings.run_config import RunConfig
 
 _FILES = (FACTS_FILE, OBJECT_FILE)
-CACHE_VARIABLE = "SB3_FOLLOW_OBJECT_CACHE"
-_SET_THE_VARIABLE = f"set {CACHE_VARIABLE} to a folder that can be written"
 
 
 def get_predictor(
@@ -41,8 +39,9 @@ def get_predictor(
             be written; or the id is not of this package.
     """
     path = _kept(FACTS_FILE, env_id, folder, report)
-    on_table = keeps_object_on_table(env_id)
-    physics = physics_id(env_id)
+    choices = surface_choices(env_id)
+    on_table = choices[0] if len(choices) == 1 else None  # else the object's learning has decided
+    physics = physics_of_task(env_id)
     return GoalPredictor.load(path.parent, env_id=env_id, physics=physics, object_on_table=on_table)
 
 
@@ -55,13 +54,13 @@ def get_object_networks(
         ValueError: as `get_predictor`; or the folder holds F_phi alone, which is not replaced.
     """
     path = _kept(OBJECT_FILE, env_id, folder, report)
-    return ObjectNetworks.load(path, env_id=env_id, physics=physics_id(env_id))
+    return ObjectNetworks.load(path, env_id=env_id, physics=physics_of_task(env_id))
 
 
 def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report: Report) -> Path:
     """Return a file of a task's first two stages, which run unless it is there already."""
     if folder is None:
-        path = cache_folder() / env_id / physics_id(env_id)
+        path = cache_folder() / env_id / physics_of_task(env_id)
     else:
         path = Path(folder).expanduser()
     if (path / name).exists():  # whole, since files take their names so: reading needs no lock
@@ -73,7 +72,7 @@ def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report:
         except OSError as error:
             raise ValueError(
                 f"{path} holds no {name} and cannot be written ({error.strerror or error}); "
-                + ("give another folder" if folder is not None else _SET_THE_VARIABLE)
+                + ("give another folder" if folder is not None else SET_THE_VARIABLE)
             ) from error
         if not (path / name).exists():
             other = next((file for file in _FILES if (path / file).exists()), None)
@@ -100,30 +99,3 @@ def learn_predictor(
     if not (Path(folder) / OBJECT_FILE).exists():
         run.object_stage.networks.save(Path(folder) / OBJECT_FILE)
     return predictor
-
-
-def cache_folder() -> Path:
-    """Return the folder that predictors are kept in; it need not exist.
-
-    Raises:
-        ValueError: there is no home folder to find it in.
-    """
-    given = os.environ.get(CACHE_VARIABLE, "")
-    try:
-        if given.strip():
-            return Path(given).expanduser()
-        return _users_cache() / "sb3_follow_object"
-    except RuntimeError as error:
-        where = f"{CACHE_VARIABLE} is {given!r}, but " if given.strip() else ""
-        raise ValueError(
-            f"{where}there is no home folder to keep predictors in; {_SET_THE_VARIABLE}"
-        ) from error
-
-
-def _users_cache() -> Path:
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home())
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return given if given.is_absolute() else Path.home() / ".cache"  # as its specification says

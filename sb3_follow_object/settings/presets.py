@@ -8,12 +8,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..any_task.tasks import check_followable, success_distance_of, surface_choices
 from ..common.plain_yaml import load_yaml
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, object_id
 from ..envs.goal_envs import check_task
 from ..envs.registration import import_task
 from ..envs.task_table import BUILT_IN
+from ..envs.tasks import SUCCESS_DISTANCE
 from ..zoo_configs import FOLDER
 from .fields import Group, Setting, check_names, settings_of
 from .learning import AlgorithmSettings, check_auxiliary
@@ -24,6 +26,14 @@ from .sizes import check_sizes
 from .stages import ReachFirstSettings, ReachTeachingSettings, StageSettings, part_of_reach
 
 PRESETS = ("default", "paper")
+# Settings in metres that are meant as shares of the distance within which goals are reached.
+_TOLERANCES = (
+    ("curriculum", "min_distance"),
+    ("replay_buffer_kwargs", "moved_distance"),
+    ("replay_buffer_kwargs", "min_goal_distance"),
+)
+# The package's task that one of one's own is set up as, by whether its object is pushed.
+SIMILAR = {True: "FollowObject/PushSideGap-v0", False: "FollowObject/PnPSimpleV2-v0"}
 
 WRAPPER = "sb3_follow_object.ImaginedGoalWrapper"
 CALLBACK = "sb3_follow_object.CurriculumCallback"
@@ -92,13 +102,19 @@ def run_config(
     settings = _of_runs(entries, path) | _flattened(entry, path)
     has_object_stage = imagine or _auxiliary_name(settings) == "sldr"
     if has_object_stage and env_id not in IDS:
-        robots = sorted(name for name, (_, alone) in IDS.items() if not alone)
-        raise ValueError(
-            f"{env_id!r} has no environment of its object alone, which imagined goals and SLDR's "
-            f"reward come from; train it with --method her, or one of {', '.join(robots)}"
-        )
-    if has_object_stage and _find(entries, object_id(env_id)) is not None:
-        settings |= _object_stage(_entry(entries, object_id(env_id), path), path)
+        if _auxiliary_name(settings) == "sldr":
+            raise ValueError(
+                f"{env_id!r} is not a task of this package, whose observations alone SLDR's reward "
+                "can read the object's state from; train it with --method fo or her"
+            )
+        check_followable(env_id)
+        if env_id not in entries:  # set up as the package's most similar task
+            if surface_choices(env_id)[0]:
+                settings = _flattened(_entry(entries, SIMILAR[True], path), path)
+            _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
+    of_object = object_id(env_id if env_id in IDS else SIMILAR[False])
+    if has_object_stage and _find(entries, of_object) is not None:
+        settings |= _object_stage(_entry(entries, of_object, path), path)
     changes: dict[str, Any] = {}
     for name, value in (overrides or {}).items():
         _override(changes, name, value)
@@ -222,7 +238,7 @@ def _find(entries: dict[str, Any], env_id: str) -> Any:
     """Return an id's entry; for a task of one's own, otherwise that of the most similar one."""
     if env_id not in entries and env_id in IDS and env_id not in BUILT_IN:
         task, alone = IDS[env_id]
-        env_id = f"FollowObject/{'PushSideGap' if task.blocked_gripper else 'PnPSimpleV2'}-v0"
+        env_id = SIMILAR[task.blocked_gripper]
         env_id = object_id(env_id) if alone else env_id
     return entries.get(env_id, entries.get(env_id.rpartition(":")[2]))
 
@@ -311,6 +327,14 @@ def _object_stage(entry: dict[str, Any], path: Path) -> dict[str, Any]:
     env_kwargs = algorithm.pop("env_kwargs", {})
     check_names(env_kwargs, ("on_table",), f"{path}: env_kwargs of the object")
     return settings | {f"object_{name}": value for name, value in env_kwargs.items()}
+
+
+def _scale_distances(settings: dict[str, Any], factor: float) -> None:
+    """Fit what presets say in metres to how near its goal an object must be."""
+    for outer, name in _TOLERANCES:
+        group = settings.get(outer)
+        if isinstance(group, dict) and name in group:
+            settings[outer] = {**group, name: round(group[name] * factor, 6)}
 
 
 def _override(settings: dict[str, Any], name: str, value: Any) -> None:

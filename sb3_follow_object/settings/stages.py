@@ -167,7 +167,11 @@ class StageSettings(Group):
         ),
     ] = None
     object_on_table: Annotated[
-        Flag | None, setting("whether the object stays on the table", none="in Push tasks")
+        Flag | None,
+        setting(
+            "whether the object stays on the table",
+            none="in Push tasks; elsewhere by the goals' heights",
+        ),
     ] = None
     object_n_envs: Annotated[
         Whole, setting("copies of the object's environment", ge=1, le=COPIES)

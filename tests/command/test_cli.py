@@ -168,7 +168,7 @@ def test_predictor_of_another_task_is_refused(
     [
         (["--env", "FollowObject/PushSidegap-v0"], f"did you mean '{TASK}'"),
         (["--env", "CartPole-v1"], "'CartPole-v1' has no goals"),
-        (["--env", "FetchPush-v4"], "'FetchPush-v4' has no environment of"),
+        (["--env", "FetchReach-v4"], "'FetchReach-v4': the achieved goal is a point of the robot"),
         ([], "say which task to train with --env"),
         (["--env", TASK, "--set", "batchsize=3"], "did you mean 'batch_size'"),
         (["--env", TASK, "--set", "batch_size"], "write key=value"),
@@ -189,7 +189,7 @@ def test_predictor_of_another_task_is_refused(
         (["--env", TASK, "--method", "rnd", "--set", "auxiliary.name=rdn"], "did you mean 'rnd'"),
         (["--env", TASK, "--method", "sldr", "--set", "auxiliary.hidden=[8]"], "'hidden'"),
         (["--env", TASK, "--method", "cher", "--set", "replay_buffer_kwargs.cher.picks=0"], "cher"),
-        (["--env", "FetchReach-v4", "--method", "sldr"], "'FetchReach-v4' has no environment of"),
+        (["--env", "FetchReach-v4", "--method", "sldr"], "'FetchReach-v4' is not a task of this"),
         (["--env", TASK, "--colour"], "unrecognized arguments: --colour"),
         (["--env", TASK, "--method", "magic"], "invalid choice: 'magic'"),
     ],

@@ -291,7 +291,7 @@ def test_override_is_read_as_yaml(text: str, expected: tuple[str, Any]) -> None:
         ("FollowObject/PnPShelv-v0", {}, "did you mean 'FollowObject/PnPShelf-v0'"),
         ("CartPole-v1", {}, "'CartPole-v1' has no goals: its observations lack achieved_goal"),
         ("no_module:Task-v0", {}, "names a module that cannot be imported"),
-        ("FetchPush-v4", {}, "'FetchPush-v4' has no environment of its object alone"),
+        ("FetchReach-v4", {}, "'FetchReach-v4': the achieved goal is a point of the robot itself"),
         (TASK, {"batchsize": 1}, "--set has no setting 'batchsize'; did you mean 'batch_size'"),
         (TASK, {"curriculum.kmax": 1}, "--set: curriculum has no setting 'kmax'"),
         (TASK, {"policy_kwargs.layernorm": 1}, "policy_kwargs has no setting 'layernorm'"),
@@ -347,11 +347,11 @@ def test_missing_file_is_refused(tmp_path: Path) -> None:
 
 
 def test_imagined_goals_need_an_object_of_its_own(tmp_path: Path) -> None:
-    file = write(tmp_path / "my.yml", imagining(), "FetchPush-v4")
-    with pytest.raises(ValueError, match="has no environment of its object alone"):
-        run_config("FetchPush-v4", file=file)
+    file = write(tmp_path / "my.yml", imagining(), "FetchReach-v4")
+    with pytest.raises(ValueError, match="there is no object to follow"):
+        run_config("FetchReach-v4", file=file)
     file = write(tmp_path / "my.yml", {"auxiliary": {"name": "sldr"}}, "FetchPush-v4")
-    with pytest.raises(ValueError, match="has no environment of its object alone"):
+    with pytest.raises(ValueError, match="is not a task of this package"):
         run_config("FetchPush-v4", file=file)
 
 

@@ -1,0 +1,237 @@
+"""Copies of the robot's environment: a few processes with several of them each."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from multiprocessing.connection import Connection
+from socket import socketpair
+from typing import Any, NoReturn
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from ..common.numbers import checked_whole
+from .batch import cores
+from .copies_worker import __name__ as WORKER
+from .make import make_vec
+from .registration import import_task
+from .robot_face import RobotTask, needs_face
+from .task_table import IDS
+
+_LEAST = 2  # copies that are worth a process
+# What judges goals and knows nothing of an episode, so that any copy may be asked.
+_JUDGES = ("compute_reward", "is_success", "_is_success")
+
+
+def robot_vec_env(env_id: str, n_envs: int, n_threads: int | None = None, **options: Any) -> VecEnv:
+    """A VecEnv of n copies of any robot's task, which all answer as `RobotTask` does.
+
+    This package's own tasks are batched; others run in processes, which give the same results
+    however many there are.
+
+    Args:
+        env_id: any gymnasium id, with "module:" before it where importing that registers it.
+        n_envs: number of copies, at least 1.
+        n_threads: threads or processes that step them; None takes one a core.
+        options: keywords of the environment.
+
+    Raises:
+        ValueError: as `make_vec`, or what the environment lacks cannot be added.
+    """
+    name = import_task(env_id)
+    if name in IDS or name not in gym.registry:
+        return make_vec(env_id, n_envs, n_threads, **options)
+    n_envs = checked_whole("n_envs", n_envs, 1)
+    n_threads = cores() if n_threads is None else checked_whole("n_threads", n_threads, 1)
+    make = robot_maker(name, **options)
+    workers = min(n_threads, n_envs // _LEAST)
+    if workers <= 1 or os.name != "posix":
+        return DummyVecEnv([make] * n_envs)
+    return ProcessVecEnv(make, n_envs, workers)
+
+
+def robot_maker(env_id: str, **options: Any) -> Callable[[], gym.Env]:
+    """Return what makes one copy of a registered task, with what it lacks of `RobotTask`."""
+    spec = gym.spec(import_task(env_id))
+    probe = gym.make(spec, **options)
+    try:
+        wrapped = may_be_faced(probe) and needs_face(probe)
+    finally:
+        probe.close()
+    return partial(_make, spec, wrapped, options)
+
+
+def may_be_faced(env: gym.Env) -> bool:
+    """Whether an environment has goals, so that `RobotTask` can add the rest."""
+    return isinstance(env.observation_space, spaces.Dict) and {"achieved_goal", "desired_goal"} <= (
+        set(env.observation_space.spaces)
+    )
+
+
+def _make(spec: EnvSpec, wrapped: bool, options: dict[str, Any]) -> gym.Env:
+    env = gym.make(spec, **options)
+    if not wrapped:
+        return env
+    return RobotTask(env, object=getattr(env, "followed_object", None))
+
+
+class ProcessVecEnv(VecEnv):
+    """Copies of an environment in processes, each of which steps several of them.
+
+    A process that steps one copy waits longer for its orders than it works; one that steps eight
+    does not. Results are those of SB3's DummyVecEnv. Goals are judged in this process, by a copy
+    that is never stepped.
+
+    Args:
+        make: makes one copy; is sent to the processes by cloudpickle.
+        n_envs: number of copies.
+        n_workers: number of processes, at most `n_envs`.
+    """
+
+    def __init__(self, make: Callable[[], gym.Env], n_envs: int, n_workers: int) -> None:
+        self._judge = make()
+        self._workers = [
+            _Worker(make, len(rows)) for rows in np.array_split(np.arange(n_envs), n_workers)
+        ]
+        self._rows = np.array_split(np.arange(n_envs), n_workers)
+        self._place = [(w, int(i)) for w, rows in enumerate(self._rows) for i in range(len(rows))]
+        self._closed = False
+        for worker in self._workers:
+            worker.answer()  # all are making theirs at once
+        super().__init__(n_envs, self._judge.observation_space, self._judge.action_space)
+        self.metadata = self._judge.metadata
+
+    def reset(self) -> dict[str, np.ndarray]:
+        """Begin an episode in every copy; seeds set by `seed()` count from here."""
+        for worker, rows in zip(self._workers, self._rows, strict=True):
+            seeds = [self._seeds[row] for row in rows]
+            worker.ask("reset", seeds, [self._options[row] for row in rows])
+        answers = [worker.answer() for worker in self._workers]
+        self.reset_infos = [info for _, infos in answers for info in infos]
+        self._reset_seeds()
+        self._reset_options()
+        return self._joined([obs for obs, _ in answers])
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Send the actions (n_envs, ...) to the processes."""
+        for worker, rows in zip(self._workers, self._rows, strict=True):
+            worker.ask("step", np.asarray(actions)[rows])
+
+    def step_wait(
+        self,
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Wait until all have stepped."""
+        answers = [worker.answer() for worker in self._workers]
+        obs, rewards, dones, infos, begun = zip(*answers, strict=True)
+        for rows, news in zip(self._rows, begun, strict=True):
+            for index, info in news.items():
+                self.reset_infos[rows[index]] = info
+        told = [info for some in infos for info in some]
+        return self._joined(obs), np.concatenate(rewards), np.concatenate(dones), told
+
+    def close(self) -> None:
+        """End the processes."""
+        if not self._closed:
+            self._closed = True
+            self._judge.close()
+            for worker in self._workers:
+                worker.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """A picture of every copy."""
+        for worker in self._workers:
+            worker.ask("render")
+        return [image for worker in self._workers for image in worker.answer()]
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether the copies have an attribute."""
+        return bool(self._judge.has_wrapper_attr(attr_name))
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Read an attribute of copies."""
+        if attr_name == "spec":
+            return [self._judge.spec for _ in self._get_indices(indices)]
+        return self._each(indices, "attribute", attr_name)
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of copies."""
+        if indices is None:
+            self._judge.set_wrapper_attr(attr_name, value)
+        self._each(indices, "set_attribute", attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of copies."""
+        if method_name in _JUDGES:
+            judge = self._judge.get_wrapper_attr(method_name)
+            return [judge(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
+        return self._each(indices, "method", method_name, method_args, method_kwargs)
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
+        """Whether copies have a wrapper of this class."""
+        return self._each(indices, "wrapped", wrapper_class)
+
+    def __reduce__(self) -> NoReturn:
+        raise ValueError(
+            "environments in processes cannot be copied; make them again, or take n_threads=1"
+        )
+
+    def _each(self, indices: Any, name: str, *arguments: Any) -> list[Any]:
+        answers = []
+        for row in self._get_indices(indices):
+            worker, index = self._place[row]
+            self._workers[worker].ask(name, index, *arguments)
+            answers.append(self._workers[worker].answer())
+        return answers
+
+    def _joined(self, parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        space = self.observation_space
+        assert isinstance(space, spaces.Dict)
+        return {
+            key: np.concatenate([part[key] for part in parts]).astype(box.dtype, copy=False)
+            for key, box in space.spaces.items()
+        }
+
+
+class _Worker:
+    """A process with some copies, and this process's end of the line to it."""
+
+    def __init__(self, make: Callable[[], gym.Env], n: int) -> None:
+        ours, theirs = socketpair()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", WORKER, str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+        )
+        theirs.close()
+        self._pipe = Connection(ours.detach())
+        self._pipe.send((sys.path, cloudpickle.dumps(make), n))
+
+    def ask(self, name: str, *arguments: Any) -> None:
+        self._pipe.send_bytes(cloudpickle.dumps((name, arguments)))
+
+    def answer(self) -> Any:
+        """Wait for what was asked; raise what went wrong there."""
+        try:
+            error, answer = self._pipe.recv()
+        except (EOFError, ConnectionError) as ended:
+            code = self._process.wait()
+            raise RuntimeError(
+                f"a process of the robot's environment has ended by itself (status {code})"
+            ) from ended
+        if error is not None:
+            raise error
+        return answer
+
+    def close(self) -> None:
+        self._pipe.close()
+        self._process.wait()

@@ -1,0 +1,220 @@
+"""Environments of others, shown as this package reads one: goals, success, rewards of -1 and 0."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from ..common.answers import one_each, one_number
+from .goal_envs import SUCCESS_METHODS, missing_goal_keys
+
+Judge = Callable[..., Any]
+GoalOf = Callable[[gym.Env, Any], tuple[Any, Any]]
+
+POSITION = 3
+_FAR = 10.0  # metres, farther than any goal is reached from
+
+
+class RobotTask(gym.Wrapper):
+    """A goal environment that says what reaching a goal is, of any environment that can tell.
+
+    Observations are a Dict of observation, achieved_goal and desired_goal; rewards are 0 on the
+    goal and -1 elsewhere; `compute_reward` and `is_success` judge any goals, in batches too, and
+    the info says `is_success`. Whatever the environment has of this is asked; two functions say
+    the rest.
+
+    Args:
+        env: any environment with a Box of actions.
+        goal: of (env, observation) -> achieved and desired goal, (3,) metres each; None where the
+            observations hold them.
+        is_success: of (achieved, desired) -> whether the goal is reached; None asks the
+            environment's method of that name, or else its `compute_reward`.
+        object: name of the body that goals are about; None finds it.
+
+    Attributes:
+        shifted: whether the environment pays 1 on the goal and 0 elsewhere.
+
+    Raises:
+        ValueError: there are no goals; at the first reset, nobody says when one is reached.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        goal: GoalOf | None = None,
+        is_success: Judge | None = None,
+        object: str | None = None,
+    ) -> None:
+        super().__init__(env)
+        self.followed_object = object
+        self.shifted = False
+        self._goal = goal
+        self._given = is_success
+        self._judge: Judge | None = None
+        self._batches = False
+        missing = missing_goal_keys(env.observation_space)
+        if goal is not None:
+            self.observation_space = _goal_space(env.observation_space)
+        elif missing:
+            raise ValueError(
+                f"{_name(env)} has no goals: its observations lack {', '.join(missing)}; say with "
+                "goal= and is_success= what is achieved, what is desired and when that is reached"
+            )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start an episode."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        shown = self.observation(obs)
+        if self._judge is None:
+            self._find_judge(np.asarray(shown["desired_goal"], dtype=np.float64))
+        return shown, info
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Step the environment; the reward is 0 on the goal, else -1."""
+        obs, _, terminated, truncated, info = self.env.step(action)
+        shown = self.observation(obs)
+        success = bool(self.is_success(shown["achieved_goal"], shown["desired_goal"]))
+        info = {**info, "is_success": success}
+        return shown, float(success) - 1.0, terminated, truncated, info
+
+    def observation(self, obs: Any) -> dict[str, np.ndarray]:
+        """Return an observation of the environment with its goals."""
+        if self._goal is None:
+            return obs
+        goals = self._goal(self.env.unwrapped, obs)
+        for name, value in zip(("achieved", "desired"), goals, strict=True):
+            if np.shape(value) != (POSITION,):
+                raise ValueError(
+                    f"goal= must return two positions of the shape (3,); the {name} one has the "
+                    f"shape {np.shape(value)}"
+                )
+        achieved, desired = (np.array(each, dtype=np.float64) for each in goals)
+        return {
+            "observation": np.concatenate(_parts(obs)),
+            "achieved_goal": achieved,
+            "desired_goal": desired,
+        }
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        """Rewards (...) of achieved goals (..., 3) for desired ones; `info` is unused."""
+        return np.asarray(self.is_success(achieved_goal, desired_goal), dtype=np.float32) - 1.0
+
+    def is_success(self, achieved_goal: Any, desired_goal: Any) -> Any:
+        """Whether goals (..., 3) are reached, bool (...); row by row where that is all there is."""
+        achieved, desired = np.asarray(achieved_goal), np.asarray(desired_goal)
+        if self._judge is None:
+            self._find_judge(desired.reshape(-1, desired.shape[-1])[0])
+        assert self._judge is not None
+        if achieved.ndim == 1:
+            return one_number(self._judge(achieved, desired), "is_success") > 0.5
+        rows = achieved.reshape(-1, achieved.shape[-1]), desired.reshape(-1, desired.shape[-1])
+        if self._batches:
+            answer = one_each(self._judge(*rows), len(rows[0]), "is_success")
+        else:
+            pairs = zip(*rows, strict=True)
+            answer = np.array([one_number(self._judge(a, d), "is_success") for a, d in pairs])
+        return (answer > 0.5).reshape(achieved.shape[:-1])
+
+    def _find_judge(self, desired: np.ndarray) -> None:
+        """Find who says whether goals are reached, and whether of many at once."""
+        judge = self._given or _success_method(self.env)
+        pays = None
+        if _has(self.env, "compute_reward") and self._goal is None:
+            pays = rewards_on_and_off(self.env, desired)
+            self.shifted = pays == (1.0, 0.0)
+            if pays != (0.0, -1.0) and not self.shifted:
+                raise ValueError(
+                    f"{_name(self.env)} pays {pays[0]:g} on the goal and {pays[1]:g} far from it; "
+                    "the rewards must be 0 and -1, or 1 and 0"
+                )
+        if judge is None and pays is None:
+            raise ValueError(
+                f"{_name(self.env)} does not tell when a goal is reached, by compute_reward or "
+                "is_success; say it with is_success="
+            )
+        if judge is None:
+            judge = self._pays_most
+        if not one_number(judge(desired, desired), "is_success"):
+            raise ValueError(f"{_name(self.env)} says of its goal that it is not reached there")
+        self._batches = _answers_batches(judge, desired)
+        self._judge = judge
+
+    def _pays_most(self, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+        """Whether the environment's reward is the one that it pays on the goal."""
+        reward = self.env.get_wrapper_attr("compute_reward")(achieved, desired, {})
+        return np.asarray(reward) > (0.5 if self.shifted else -0.5)
+
+
+def needs_face(env: gym.Env) -> bool:
+    """Whether an environment, which is reset and stepped, lacks what `RobotTask` adds."""
+    if missing_goal_keys(env.observation_space) or not _has(env, "compute_reward"):
+        return True
+    success, reward = _success_method(env), env.get_wrapper_attr("compute_reward")
+    if success is None:
+        return True
+    obs, _ = env.reset(seed=0)
+    desired = np.asarray(obs["desired_goal"], dtype=np.float64)
+    told = env.step(env.action_space.sample())[4]
+    return not (
+        "is_success" in told
+        and rewards_on_and_off(env, desired)[1] < 0.0
+        and _answers_batches(lambda a, d: reward(a, d, {}), desired)
+        and _answers_batches(success, desired)
+    )
+
+
+def rewards_on_and_off(env: gym.Env, desired: np.ndarray) -> tuple[float, float]:
+    """What an environment's `compute_reward` pays on a goal (3,) and far from it."""
+    reward = env.get_wrapper_attr("compute_reward")
+    pays = (reward(achieved, desired, {}) for achieved in (desired, desired + _FAR))
+    on, off = (one_number(each, "compute_reward") for each in pays)
+    return on, off
+
+
+def _success_method(env: gym.Env) -> Judge | None:
+    for name in SUCCESS_METHODS:
+        if _has(env, name):
+            method: Judge = env.get_wrapper_attr(name)
+            return method
+    return None
+
+
+def _has(env: gym.Env, name: str) -> bool:
+    return env.has_wrapper_attr(name) and callable(env.get_wrapper_attr(name))
+
+
+def _answers_batches(judge: Judge, desired: np.ndarray) -> bool:
+    """Whether a function says of rows what it says of each alone."""
+    achieved = desired + np.array([0.0, _FAR, 0.01])[:, None]
+    alone = [one_number(judge(row, desired), "the judge of goals") for row in achieved]
+    try:
+        told = one_each(judge(achieved, np.tile(desired, (3, 1))), 3, "the judge of goals")
+    except Exception:  # a function of somebody's for one goal may raise anything
+        return False
+    return bool(np.allclose(told.astype(float), alone, atol=1e-6))
+
+
+def _goal_space(space: spaces.Space) -> spaces.Dict:
+    """The space of observations with goals that are positions."""
+    size = sum(part.size for part in _parts(space.sample()))
+    sizes = {"observation": size, "achieved_goal": POSITION, "desired_goal": POSITION}
+    return spaces.Dict(
+        {key: spaces.Box(-np.inf, np.inf, (n,), np.float64) for key, n in sizes.items()}
+    )
+
+
+def _parts(obs: Any) -> list[np.ndarray]:
+    """The vectors that an observation is made of, in the order of their names."""
+    if isinstance(obs, dict):
+        return [part for name in sorted(obs) for part in _parts(obs[name])]
+    return [np.asarray(obs, dtype=np.float64).ravel()]
+
+
+def _name(env: gym.Env) -> str:
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__

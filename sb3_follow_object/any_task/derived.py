@@ -1,0 +1,250 @@
+"""A task that nobody here wrote, looked at: its object, goals, physics, and the scene of both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ..common.cache import SET_THE_VARIABLE, cache_folder
+from ..common.files import lock
+from ..common.numbers import checked_whole
+from ..common.reports import Report
+from ..envs.goal_envs import missing_goal_keys
+from ..envs.physics_engine import mujoco
+from ..envs.registration import import_task
+from ..envs.robot_copies import robot_maker
+from ..envs.robot_face import POSITION, RobotTask, rewards_on_and_off
+from .finding import Candidate, Observed, candidates, find_effector, find_object, observe
+from .physics_access import physics_of
+from .resets import Resets, record_resets, varying_bodies
+from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of
+
+N_RESETS = 2000  # episodes that are recorded; of a hundred F_phi does not learn the places between
+_FEW = 20  # of them say what varies
+_LONG, _LONG_T = 100, 50  # episodes of more steps than this have an object whose T is that
+_FILE = "resets.safetensors"
+_FARTHEST = 0.5  # metres at which no goal is reached any more
+_HALVINGS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Derived:
+    """What was found out of a task.
+
+    Attributes:
+        env_id: of the robot's task.
+        object: the body that goals are about.
+        second: how far off the next body is that is not the robot's, metres; None, there is none.
+        effector: where the observation holds a part of the robot; None, nowhere.
+        horizon: T of the robot's episodes.
+        success_distance: metres within which a goal is reached in every direction.
+        varying: names of what stands elsewhere in each episode.
+        shifted: whether rewards of 1 and 0 are shown as 0 and -1.
+        physics: hash of what decides how the object moves and where goals lie.
+        resets: recorded.
+        scene: of the object alone.
+    """
+
+    env_id: str
+    object: Candidate
+    second: float | None
+    effector: tuple[int, int, int] | None
+    horizon: int
+    success_distance: float
+    varying: tuple[str, ...]
+    shifted: bool
+    physics: str
+    resets: Resets
+    scene: DerivedScene
+
+    @property
+    def on_surface(self) -> bool:
+        """Whether goals lie as high as the object starts, so that it shall stay on its surface."""
+        return self.resets.on_surface()
+
+
+def derived(env_id: str, report: Report = lambda sentence: None) -> Derived:
+    """Return what a registered task is; looked at once a process.
+
+    Args:
+        env_id: gymnasium id, with "module:" before it where importing that registers it.
+        report: told where resets are being recorded, which may take minutes.
+
+    Raises:
+        ValueError: the object's own scene cannot be made of it, with what would help.
+    """
+    name = import_task(env_id)
+    if name not in gym.registry:
+        raise ValueError(f"there is no environment {env_id!r}")
+    spec = gym.registry[name]
+    key = (name, spec.entry_point, repr(sorted(spec.kwargs.items(), key=str)))
+    if key not in _LOOKED_AT:
+        _LOOKED_AT[key] = _look(name, report)
+    return _LOOKED_AT[key]
+
+
+_LOOKED_AT: dict[Any, Derived] = {}
+
+
+def object_horizon(horizon: int) -> int:
+    """T of the object's episodes where the robot's have this one.
+
+    An object that moves by itself needs no more steps than those of the paper's tasks.
+    """
+    return horizon if horizon <= _LONG else _LONG_T
+
+
+def _look(env_id: str, report: Report) -> Derived:
+    try:
+        env = robot_maker(env_id)()
+    except ValueError:
+        raise
+    except Exception as error:  # an environment of somebody's may raise anything
+        raise ValueError(f"{env_id!r} cannot be made: {error or type(error).__name__}") from error
+    try:
+        return _look_at(env_id, env, report)
+    except ValueError as error:
+        raise ValueError(f"{env_id!r}: {error}") from error
+    finally:
+        env.close()
+
+
+def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
+    missing = missing_goal_keys(env.observation_space)
+    if missing:
+        raise ValueError(
+            f"there are no goals: its observations lack {', '.join(missing)}; say with goal= and "
+            "is_success= what is achieved, what is desired and when that is reached"
+        )
+    horizon = _horizon(env)
+    shape = env.observation_space["desired_goal"].shape  # type: ignore[index]
+    if shape != (POSITION,):
+        raise ValueError(f"goals must be positions of the shape (3,), not {shape}")
+    few, model, data = record_resets(env, _FEW)
+    on, off = rewards_on_and_off(env, few.goals[0])
+    if (on, off) != (0.0, -1.0):
+        raise ValueError(
+            f"it pays {on:g} on the goal and {off:g} far from it; the rewards must be 0 and -1, or "
+            "1 and 0"
+        )
+    seen = observe(env)
+    wanted = _named_object(env)
+    found = find_object(seen, wanted)
+    if ends_at_goal(env, found.body):
+        raise ValueError(
+            "it ends its episodes at the goal; imagined goals need episodes that go on to their "
+            "time limit: turn that off in the environment"
+        )
+    within = success_distance(env, few.goals[:5])
+    drawn = _drawn(env_id, env, few, horizon, within)
+    physics = physics_digest_of(model, found.body, found.offset, few, drawn)
+    resets = _kept_resets(env_id, env, physics, report)
+    task = DerivedTask(env_id, object_horizon(horizon), physics)
+    return Derived(
+        env_id,
+        found,
+        _second(seen, found),
+        find_effector(seen),
+        horizon,
+        within,
+        tuple(str(model.body(body).name) for body in sorted(varying_bodies(model, resets))),
+        bool(isinstance(env, RobotTask) and env.shifted),
+        physics,
+        resets,
+        object_scene_of(model, data, found.body, found.offset, resets, task, within),
+    )
+
+
+def success_distance(env: gym.Env, goals: np.ndarray) -> float:
+    """Return how far off a goal, in whichever direction, the environment says it is reached.
+
+    Args:
+        env: with `is_success` of `RobotTask` or gymnasium-robotics.
+        goals: to try, (n, 3) metres.
+
+    Raises:
+        ValueError: it is not reached on the spot, or far away too.
+    """
+    name = "is_success" if env.has_wrapper_attr("is_success") else "_is_success"
+    judge: Callable[..., Any] = env.get_wrapper_attr(name)
+    ways = np.concatenate([np.eye(3), -np.eye(3)])
+    goal, way = np.repeat(goals, len(ways), axis=0), np.tile(ways, (len(goals), 1))
+    low, high = np.zeros(len(goal)), np.full(len(goal), _FARTHEST)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        reached = np.asarray(judge(goal + middle[:, None] * way, goal)).astype(bool)
+        low, high = np.where(reached, middle, low), np.where(reached, high, middle)
+    nearest = round(float(high.min()), 4)
+    if not 0.0 < nearest < 0.99 * _FARTHEST:
+        raise ValueError(
+            f"is_success calls goals reached within {nearest} m; it must be more than 0 and less "
+            f"than {_FARTHEST}"
+        )
+    return nearest
+
+
+def ends_at_goal(env: gym.Env, body: int) -> bool:
+    """Whether an episode is terminated once an object with a free joint is put on its goal."""
+    obs, _ = env.reset(seed=0)
+    model, data = physics_of(env)
+    joint = int(model.body_jntadr[body])
+    if int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_FREE):
+        return False
+    place = int(model.jnt_qposadr[joint])
+    data.qpos[place : place + 3] += obs["desired_goal"] - obs["achieved_goal"]
+    mujoco.mj_forward(model, data)
+    return bool(env.step(np.zeros_like(env.action_space.sample()))[2])
+
+
+def _horizon(env: gym.Env) -> int:
+    steps = None if env.spec is None else env.spec.max_episode_steps
+    if steps is None:
+        raise ValueError(
+            "it does not say how long its episodes are; register it with max_episode_steps, or "
+            "wrap it in gymnasium.wrappers.TimeLimit"
+        )
+    return checked_whole("max_episode_steps", steps, 1)
+
+
+def _named_object(env: gym.Env) -> str | None:
+    """The object's name where whoever made the environment has given it."""
+    if not env.has_wrapper_attr("followed_object"):
+        return None
+    name: str | None = env.get_wrapper_attr("followed_object")
+    return name
+
+
+def _second(seen: Observed, found: Candidate) -> float | None:
+    others = (e.error for e in candidates(seen) if e.body != found.body and not e.of_robot)
+    return next(others, None)
+
+
+def _drawn(env_id: str, env: gym.Env, few: Resets, horizon: int, within: float) -> str:
+    """What decides how episodes are drawn: the first ones, where seeds say them again."""
+    again, _, _ = record_resets(env, 2)
+    repeats = np.array_equal(again.goals, few.goals[:2])
+    episodes = np.concatenate([few.goals, few.starts]).round(5).tolist() if repeats else ""
+    return f"{env_id} {horizon} {within} {mujoco.__version__.split('.')[0]} {episodes}"
+
+
+def _kept_resets(env_id: str, env: gym.Env, physics: str, report: Report) -> Resets:
+    """Return the recorded resets of a task, recorded now unless they are kept from before."""
+    folder = cache_folder() / env_id / physics
+    path = folder / _FILE
+    if path.exists():
+        return Resets.load(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(
+            f"{folder} cannot be written ({error.strerror or error}); {SET_THE_VARIABLE}"
+        ) from error
+    with lock(folder, wait=True):
+        if not path.exists():
+            report(f"where {N_RESETS} episodes of {env_id} begin is recorded, once")
+            record_resets(env, N_RESETS)[0].save(path)
+    return Resets.load(path)

@@ -1,0 +1,223 @@
+"""The object, found by observation: the body that the achieved goal is a fixed point of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+
+from ..envs.physics_engine import mujoco
+from .physics_access import physics_of
+from .robot_parts import body_name, carrier, robot_bodies
+
+N_RESETS, N_STEPS = 20, 30  # watched, the steps after one reset at random
+TOLERANCE = 1e-3  # metres that a body's fixed point may lie off the achieved goal
+_SAME_PLACE = 1e-5  # metres between an effector and what the observation says of it
+_NUDGE = np.array([0.02, -0.03, 0.05])  # metres
+_LEAST_MOVED = 1e-3  # metres that a thing must have moved to be told from others
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A body whose fixed point the achieved goal may be.
+
+    Attributes:
+        body: id of the body that carries the joints.
+        name: of the body, as errors and reports call it.
+        offset: of the point in the body's frame, (3,) metres.
+        error: largest distance between point and achieved goal that was seen, metres.
+        of_robot: whether the body belongs to the robot.
+    """
+
+    body: int
+    name: str
+    offset: np.ndarray
+    error: float
+    of_robot: bool
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What was seen of an environment in some episodes at random.
+
+    Attributes:
+        achieved, desired: goals, (n, 3) each, metres.
+        observations: (n, size).
+        positions: of bodies, (n, nbody, 3) metres.
+        rotations: of bodies, (n, nbody, 3, 3).
+        sites: positions of sites, (n, nsite, 3) metres.
+        terminated: whether an episode ended before its time.
+        model: the last reset's.
+    """
+
+    achieved: np.ndarray
+    desired: np.ndarray
+    observations: np.ndarray
+    positions: np.ndarray
+    rotations: np.ndarray
+    sites: np.ndarray
+    terminated: bool
+    model: mujoco.MjModel
+
+
+def observe(env: gym.Env, n_resets: int = N_RESETS, n_steps: int = N_STEPS) -> Observed:
+    """Watch how some episodes begin, some random steps, and where things go that are nudged.
+
+    At random a robot hardly touches anything: what never moved could not be told apart.
+
+    Args:
+        env: with Dict goal observations; resets and steps are done in it.
+        n_resets: episodes that are begun, >= 1.
+        n_steps: random steps after the last reset, >= 0.
+
+    Raises:
+        ValueError: there is no MuJoCo simulation in it.
+    """
+    env.action_space.seed(0)
+    rows: list[tuple[np.ndarray, ...]] = []
+    terminated = False
+
+    def keep(obs: dict[str, np.ndarray]) -> None:
+        _, data = physics_of(env)
+        goals = (np.array(obs[key], np.float64) for key in ("achieved_goal", "desired_goal"))
+        seen = np.array(obs["observation"], np.float64).ravel()
+        frames = data.xmat.reshape(-1, 3, 3).copy()
+        rows.append((*goals, seen, data.xpos.copy(), frames, data.site_xpos.copy()))
+
+    for seed in range(n_resets):
+        obs, _ = env.reset(seed=seed)
+        keep(obs)
+    for _ in range(n_steps):
+        obs, _, ended, truncated, _ = env.step(env.action_space.sample())
+        keep(obs)
+        terminated |= bool(ended)
+        if ended or truncated:
+            obs, _ = env.reset()
+    for root in _passive_roots(physics_of(env)[0]):
+        env.reset(seed=0)
+        _nudge(*physics_of(env), root)
+        keep(env.step(np.zeros_like(env.action_space.sample()))[0])
+    achieved, desired, told, positions, rotations, sites = map(np.stack, zip(*rows, strict=True))
+    return Observed(
+        achieved, desired, told, positions, rotations, sites, terminated, physics_of(env)[0]
+    )
+
+
+def candidates(seen: Observed) -> list[Candidate]:
+    """Every body with a joint above it, the best match of each rigid group, best first."""
+    model, robot = seen.model, robot_bodies(seen.model)
+    best: dict[int, Candidate] = {}
+    for body in range(1, model.nbody):
+        root = carrier(model, body)
+        if root == 0:
+            continue
+        offset, error = _fixed_point(seen, root)
+        name = body_name(model, body)
+        if root not in best:
+            best[root] = Candidate(root, name, offset, error, bool(robot[root]))
+    return sorted(best.values(), key=lambda each: each.error)
+
+
+def find_object(seen: Observed, wanted: str | None = None) -> Candidate:
+    """Return the body whose fixed point the achieved goal is.
+
+    Args:
+        seen: of the environment.
+        wanted: name of the object's body, where several would fit; None takes the one that does.
+
+    Raises:
+        ValueError: no body fits, only the robot's do, several do, or the one wanted does not.
+    """
+    found = candidates(seen)
+    if wanted is not None:
+        return _named(seen, found, wanted)
+    fitting = [each for each in found if each.error <= TOLERANCE]
+    free = [each for each in fitting if not each.of_robot]
+    if not fitting:
+        near = "; ".join(f"{each.name} is off by {each.error * 1e3:.0f} mm" for each in found[:3])
+        raise ValueError(
+            f"no body moves with the achieved goal ({near or 'nothing in the scene has a joint'}); "
+            "achieved goals must be a point that is fixed to the object"
+        )
+    if not free:
+        raise ValueError(
+            "the achieved goal is a point of the robot itself "
+            f"({', '.join(each.name for each in fitting[:5])}): there is no object to follow; "
+            "train it with --method her"
+        )
+    if len(free) > 1:
+        raise ValueError(
+            "several bodies move with the achieved goal: "
+            f"{', '.join(each.name for each in free)}; name one of them as the object"
+        )
+    return free[0]
+
+
+def find_effector(seen: Observed) -> tuple[int, int, int] | None:
+    """Return where the observation holds the position of a part of the robot; None, nowhere.
+
+    Sites are looked at before bodies, for authors mark with them what grips or pushes.
+    """
+    robot = robot_bodies(seen.model)
+    of_sites = robot[seen.model.site_bodyid]
+    for points, of_robot in ((seen.sites, of_sites), (seen.positions, robot)):
+        for first in range(seen.observations.shape[1] - 2):
+            told = seen.observations[:, first : first + 3]
+            if np.ptp(told, axis=0).max() < _LEAST_MOVED:
+                continue
+            distance = np.abs(points - told[:, None]).max(axis=(0, 2))
+            if (of_robot & (distance <= _SAME_PLACE)).any():
+                return first, first + 1, first + 2
+    return None
+
+
+def _passive_roots(model: mujoco.MjModel) -> list[int]:
+    """Bodies with joints of their own that are not the robot's."""
+    robot = robot_bodies(model)
+    return [b for b in range(1, model.nbody) if model.body_jntnum[b] and not robot[b]]
+
+
+def _nudge(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> None:
+    """Move a body along its joints: a free one up and aside, others into their range."""
+    first = int(model.body_jntadr[body])
+    for joint in range(first, first + int(model.body_jntnum[body])):
+        adr = int(model.jnt_qposadr[joint])
+        if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):
+            data.qpos[adr : adr + 3] += _NUDGE
+        elif int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_BALL):
+            low, high = model.jnt_range[joint]
+            limited = bool(model.jnt_limited[joint])
+            data.qpos[adr] = (low + high) / 2 if limited else data.qpos[adr] + _NUDGE[2]
+    mujoco.mj_forward(model, data)
+
+
+def _fixed_point(seen: Observed, body: int) -> tuple[np.ndarray, float]:
+    """The point of a body's frame that is nearest to the achieved goals, and its largest error."""
+    position, rotation = seen.positions[:, body], seen.rotations[:, body]
+    local = np.einsum("nji,nj->ni", rotation, seen.achieved - position)
+    offset = local.mean(axis=0)
+    error = np.linalg.norm(local - offset, axis=1).max()
+    return offset, float(error)
+
+
+def _named(seen: Observed, found: list[Candidate], wanted: str) -> Candidate:
+    model = seen.model
+    known = {str(model.body(body).name): body for body in range(1, model.nbody)}
+    known |= {str(model.geom(g).name): int(model.geom_bodyid[g]) for g in range(model.ngeom)}
+    known |= {str(model.site(s).name): int(model.site_bodyid[s]) for s in range(model.nsite)}
+    names = ", ".join(each.name for each in found if not each.of_robot)
+    if wanted not in known:
+        raise ValueError(f"the scene has no body {wanted!r}; those that can move are {names}")
+    root = carrier(model, known[wanted])
+    each = next((each for each in found if each.body == root), None)
+    if each is None:
+        raise ValueError(f"{wanted!r} has no joint, so it cannot move; those that can are {names}")
+    if each.of_robot:
+        raise ValueError(f"{wanted!r} is a part of the robot; other bodies that can move: {names}")
+    if each.error > TOLERANCE:
+        raise ValueError(
+            f"the achieved goal does not move with {wanted!r}: it is off by up to "
+            f"{each.error * 1e3:.0f} mm; the nearest body is {found[0].name}"
+        )
+    return Candidate(each.body, wanted, each.offset, each.error, False)

@@ -1,0 +1,98 @@
+"""Which bodies of a compiled model are the robot's, and which move with each other."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..envs.physics_engine import mujoco
+
+_PULLS = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT)
+
+
+def robot_bodies(model: mujoco.MjModel) -> np.ndarray:
+    """Whether each body belongs to a robot, bool (nbody,).
+
+    A robot is what hangs on the first joint of a chain that an actuator drives, or a mocap body
+    that pulls. Such mocap bodies belong to it; joints without an actuator do not make a robot.
+    """
+    robot = np.zeros(model.nbody, dtype=bool)
+    for body in _driven(model):
+        root = first_jointed(model, body)
+        if root:
+            robot[root] = True
+    for body in range(1, model.nbody):  # parents come before their children
+        robot[body] |= robot[model.body_parentid[body]]
+    for mocap, _ in _pulled(model):
+        robot[mocap] = True
+    return robot
+
+
+def first_jointed(model: mujoco.MjModel, body: int) -> int:
+    """The body nearest to the world on the way to this one that has a joint; 0, none has."""
+    first = 0
+    while body:
+        if model.body_jntnum[body]:
+            first = body
+        body = int(model.body_parentid[body])
+    return first
+
+
+def carrier(model: mujoco.MjModel, body: int) -> int:
+    """The body with the joints that this one is rigidly fixed to, maybe itself; 0, the world."""
+    return int(model.body_weldid[body])
+
+
+def rigid_group(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """The bodies that are rigidly fixed to each other and to this one, (n,)."""
+    return np.flatnonzero(model.body_weldid == model.body_weldid[body])
+
+
+def body_name(model: mujoco.MjModel, body: int) -> str:
+    """A body's name, or "body 7" where it has none."""
+    return str(model.body(body).name) or f"body {body}"
+
+
+def _driven(model: mujoco.MjModel) -> set[int]:
+    """Bodies that an actuator or a pulling mocap body moves."""
+    kinds = mujoco.mjtTrn
+    driven: set[int] = {pulled for _, pulled in _pulled(model)}
+    for kind, target in zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True):
+        kind = int(kind)
+        if kind in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
+            driven.add(int(model.jnt_bodyid[target]))
+        elif kind == int(kinds.mjTRN_TENDON):
+            driven |= _on_tendon(model, int(target))
+        elif kind == int(kinds.mjTRN_BODY):
+            driven.add(int(target))
+        elif kind in (int(kinds.mjTRN_SITE), int(kinds.mjTRN_SLIDERCRANK)):
+            driven.add(int(model.site_bodyid[target]))
+    return driven
+
+
+def _on_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
+    first = int(model.tendon_adr[tendon])
+    bodies: set[int] = set()
+    for wrap in range(first, first + int(model.tendon_num[tendon])):
+        kind, target = int(model.wrap_type[wrap]), int(model.wrap_objid[wrap])
+        if kind == int(mujoco.mjtWrap.mjWRAP_JOINT):
+            bodies.add(int(model.jnt_bodyid[target]))
+        elif kind == int(mujoco.mjtWrap.mjWRAP_SITE):
+            bodies.add(int(model.site_bodyid[target]))
+    return bodies
+
+
+def _pulled(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """Pairs of a mocap body and the body that it is welded or connected to."""
+    pairs = []
+    for kind, objects, first, second in zip(
+        model.eq_type, model.eq_objtype, model.eq_obj1id, model.eq_obj2id, strict=True
+    ):
+        if int(kind) not in map(int, _PULLS):
+            continue
+        bodies = [int(first), int(second)]
+        if int(objects) == int(mujoco.mjtObj.mjOBJ_SITE):
+            bodies = [int(model.site_bodyid[site]) for site in bodies]
+        for mocap, pulled in (bodies, bodies[::-1]):
+            if model.body_mocapid[mocap] >= 0 and pulled:
+                pairs.append((mocap, pulled))
+    return pairs

@@ -1,0 +1,199 @@
+"""The object's own scene of a task that nobody here wrote, ready to be simulated in batches."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..envs.physics_engine import mujoco
+from .resets import Resets, varying_bodies
+from .robot_parts import rigid_group
+from .transcription import Transcription, transcribe
+
+STEP = 0.04  # seconds of an env step, as in the package's own tasks
+POINT, PULLER = "followed:point", "followed:mocap"
+_SIZES = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
+_LEAST_MASS = 1e-9  # kg
+# What decides the object's motion and does not change from episode to episode.
+_PHYSICS = (
+    "geom_type geom_pos geom_quat geom_size geom_contype geom_conaffinity geom_condim "
+    "geom_friction geom_margin geom_gap geom_solref geom_solimp jnt_type jnt_axis jnt_range "
+    "jnt_stiffness dof_damping dof_frictionloss dof_armature"
+)
+
+
+@dataclass(frozen=True)
+class DerivedTask:
+    """What a simulation asks a task.
+
+    Args:
+        name: gymnasium id of the robot's task.
+        horizon: T of the object's episodes.
+        physics: hash of what decides how the object moves.
+    """
+
+    name: str
+    horizon: int
+    physics: str
+    tube: tuple[()] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class DerivedScene:
+    """A compiled scene of an object alone and the episodes that it plays; shared by all copies.
+
+    Args:
+        task: whose it is.
+        model: the physics, not to be written to.
+        welded: body that the mocap body pulls, an id of `model`.
+        qpos, qvel: of the joints, (n, nq) and (n, nv), a row an episode.
+        mocap: of the bodies that stand elsewhere in each episode, (n, m, 7).
+        goals: (n, 3) metres.
+        substeps: of the physics in an env step of 0.04 s.
+        success_distance: metres within which a goal is reached.
+    """
+
+    task: DerivedTask
+    model: mujoco.MjModel
+    welded: int
+    qpos: np.ndarray
+    qvel: np.ndarray
+    mocap: np.ndarray
+    goals: np.ndarray
+    substeps: int
+    success_distance: float
+    alone: bool = True
+    time: float = 0.0
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> DerivedScene:
+        return self
+
+
+def object_scene_of(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    body: int,
+    offset: np.ndarray,
+    resets: Resets,
+    task: DerivedTask,
+    success_distance: float,
+) -> DerivedScene:
+    """Make the scene in which a body moves by itself, pulled by a mocap body (section 4.1).
+
+    Args:
+        model: of the robot's environment.
+        data: its state at a reset's end.
+        body: of the object, with its joints.
+        offset: of the point that goals are about, in the body's frame, (3,) metres.
+        resets: episodes to play.
+        task: whose scene it is.
+        success_distance: metres.
+
+    Raises:
+        ValueError: the object has no mass, or the scene holds what cannot be copied.
+    """
+    copied = transcribe(model, data, varying_bodies(model, resets))
+    heavy = _heaviest(model, body)
+    spec = copied.spec
+    spec.body(copied.bodies[body]).add_site(name=POINT, pos=offset)
+    pull(spec, copied.bodies[heavy])
+    alone = spec.compile()
+    substeps = max(1, round(STEP / alone.opt.timestep))
+    positions, velocities = _places_in(model, alone, copied)
+    return DerivedScene(
+        task,
+        alone,
+        int(alone.body(copied.bodies[heavy]).id),
+        resets.qpos[:, positions],
+        resets.qvel[:, velocities],
+        _standing(alone, copied, resets),
+        resets.goals,
+        substeps,
+        success_distance,
+    )
+
+
+def pull(spec: mujoco.MjSpec, body: str) -> None:
+    """Weld a body of a spec to a new mocap body."""
+    spec.worldbody.add_body(name=PULLER, mocap=True)
+    weld = spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1=PULLER,
+        name2=body,
+        solref=[0.02, 1.0],
+        solimp=[0.9, 0.95, 0.001, 0.5, 2.0],
+    )
+    weld.data[:11] = [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]  # same pose, torque scale 1
+
+
+def physics_digest_of(
+    model: mujoco.MjModel, body: int, offset: np.ndarray, resets: Resets, drawn: str
+) -> str:
+    """A short hash of what decides how the object moves and where goals lie.
+
+    Where bodies stand in one episode or another is left out, since it may not repeat itself.
+
+    Args:
+        model: of the robot's environment.
+        body: of the object.
+        offset: of its point, (3,).
+        resets: a few.
+        drawn: what decides how episodes are drawn, as far as that is known.
+    """
+    varying = varying_bodies(model, resets)
+    parts = [str(body), drawn, f"{model.opt.timestep:.9g}", str(model.opt.gravity)]
+    fixed = [b for b in range(model.nbody) if b not in varying and b != body]
+    arrays = {
+        "offset": offset.round(6),
+        "body_pos": model.body_pos[fixed].round(6),
+        "body_mass": model.body_mass,
+        "body_inertia": model.body_inertia,
+        **{name: getattr(model, name) for name in _PHYSICS.split()},
+    }
+    for name, values in arrays.items():
+        flat = np.asarray(values, dtype=np.float64).ravel() + 0.0  # no -0
+        parts.append(name + " ".join(f"{value:.7g}" for value in flat))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+
+
+def _heaviest(model: mujoco.MjModel, body: int) -> int:
+    """The body of an object's rigid parts that has the mass: a weld pulls no other with force."""
+    group = rigid_group(model, body)
+    if model.body_mass[body] > 0.5 * model.body_mass[group].sum():
+        return body
+    heavy = int(group[np.argmax(model.body_mass[group])])
+    if model.body_mass[heavy] <= _LEAST_MASS:
+        raise ValueError(
+            f"the object {model.body(body).name!r} has no mass, so nothing can pull it; give its "
+            "body a mass, or its geoms"
+        )
+    return heavy
+
+
+def _places_in(
+    model: mujoco.MjModel, alone: mujoco.MjModel, copied: Transcription
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which of a model's positions and velocities are those of the object's scene, in order."""
+    positions, velocities = np.zeros(alone.nq, dtype=int), np.zeros(alone.nv, dtype=int)
+    for joint, name in copied.joints.items():
+        new = alone.joint(name).id
+        n_pos, n_vel = _SIZES[int(model.jnt_type[joint])]
+        pos, vel = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        new_pos, new_vel = int(alone.jnt_qposadr[new]), int(alone.jnt_dofadr[new])
+        positions[new_pos : new_pos + n_pos] = np.arange(pos, pos + n_pos)
+        velocities[new_vel : new_vel + n_vel] = np.arange(vel, vel + n_vel)
+    return positions, velocities
+
+
+def _standing(alone: mujoco.MjModel, copied: Transcription, resets: Resets) -> np.ndarray:
+    """Places (n, nmocap, 7) of the scene's mocap bodies; the puller's are not read."""
+    places = np.zeros((len(resets), alone.nmocap, 7))
+    places[:, :, 3] = 1.0
+    for body in copied.standing:
+        mocap = int(alone.body_mocapid[alone.body(copied.bodies[body]).id])
+        places[:, mocap] = resets.places[:, body]
+    return places

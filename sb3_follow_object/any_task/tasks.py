@@ -1,0 +1,110 @@
+"""What the stages ask of a task, whether it is this package's own or anybody's."""
+
+from __future__ import annotations
+
+from stable_baselines3.common.vec_env import VecEnv
+
+from ..common.reports import Report
+from ..envs import IDS, make_vec, object_id, physics_id
+from ..envs.tasks import SUCCESS_DISTANCE
+from .derived import derived, object_horizon
+from .simulation import DerivedObjectVecEnv
+
+SURFACE_STEPS = 120_000  # env steps after which an object left on its surface may leave it
+
+
+def check_followable(env_id: str, report: Report = lambda sentence: None) -> None:
+    """Raise a ValueError with the reason if a task's object cannot be followed.
+
+    Args:
+        env_id: gymnasium id.
+        report: told where that takes long.
+    """
+    if env_id not in IDS:
+        derived(env_id, report)
+
+
+def what_is_followed(env_id: str) -> str:
+    """A sentence about what was found out of a task of others; "" for this package's own.
+
+    Raises:
+        ValueError: its object cannot be followed.
+    """
+    if env_id in IDS:
+        return ""
+    found = derived(env_id)
+    within = f"goals are reached within {found.success_distance * 1e3:.0f} mm"
+    shifted = "; rewards of 1 and 0 are shown as 0 and -1" if found.shifted else ""
+    unseen = f"; where {', '.join(found.varying)} stand is not seen" if found.varying else ""
+    return f"the object of {env_id} is {found.object.name}, {within}{shifted}{unseen}"
+
+
+def success_distance_of(env_id: str) -> float:
+    """Metres within which a task's goals are reached.
+
+    Raises:
+        ValueError: its object cannot be followed.
+    """
+    return SUCCESS_DISTANCE if env_id in IDS else derived(env_id).success_distance
+
+
+def physics_of_task(env_id: str) -> str:
+    """A short hash of what decides how the object moves and where goals lie in a task.
+
+    Raises:
+        ValueError: its object cannot be followed.
+    """
+    return physics_id(env_id) if env_id in IDS else derived(env_id).physics
+
+
+def surface_choices(env_id: str, setting: bool | None = None) -> tuple[bool, ...]:
+    """Whether the object may not leave its surface in the first stage; in the order of trial.
+
+    Args:
+        env_id: a task.
+        setting: None decides by the task: in this package's own, yes where the gripper is blocked
+            (Push tasks). In others, yes where goals lie as high as the object starts; if it does
+            not learn that it may leave the surface after all.
+
+    Raises:
+        ValueError: the task's object cannot be followed.
+    """
+    if setting is not None:
+        return (setting,)
+    if env_id in IDS:
+        return (IDS[env_id][0].blocked_gripper,)
+    return (True, False) if derived(env_id).on_surface else (False,)
+
+
+def object_vec_env(
+    env_id: str, n_envs: int, n_threads: int | None = None, *, on_table: bool = False
+) -> VecEnv:
+    """Copies of a task's object alone (section 4.1).
+
+    Args:
+        env_id: a task of the robot's.
+        n_envs: number of copies, at least 1.
+        n_threads: threads that step them; None takes one a core.
+        on_table: whether the object may not leave its surface.
+
+    Raises:
+        ValueError: the task's object cannot be followed, or a number is below 1.
+    """
+    if env_id in IDS:
+        env: VecEnv = make_vec(object_id(env_id), n_envs, n_threads, on_table=on_table)
+        return env
+    return DerivedObjectVecEnv(derived(env_id).scene, n_envs, n_threads, on_table=on_table)
+
+
+def steps_of_object(env_id: str, horizon: int) -> int:
+    """T of the object's episodes, where the robot's have `horizon` steps."""
+    return horizon if env_id in IDS else object_horizon(horizon)
+
+
+def effector_of(env_id: str) -> tuple[int, int, int] | None:
+    """Where a task's observation holds the effector's position; None, it was not found.
+
+    Raises:
+        ValueError: the task's object cannot be followed.
+    """
+    return (0, 1, 2) if env_id in IDS else derived(env_id).effector

@@ -1,0 +1,287 @@
+"""The passive part of a compiled model, written anew: what moves without the robot (section 4.1).
+
+MuJoCo makes no spec of a compiled model, and the XML that a model came from is often not at hand or
+no longer true. The compiled numbers are: they are copied into a fresh spec one by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..envs.physics_engine import mujoco
+from .robot_parts import robot_bodies
+
+_JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
+_EQUALITIES = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_JOINT)
+
+
+@dataclass
+class Transcription:
+    """A spec of the passive part, and where each of its things was in the model.
+
+    Attributes:
+        spec: not compiled yet; may be added to.
+        bodies: body of the model -> name in the spec.
+        joints: joint of the model -> name in the spec.
+        standing: bodies that nothing moves within an episode and that are mocap bodies here.
+    """
+
+    spec: mujoco.MjSpec
+    bodies: dict[int, str] = field(default_factory=dict)
+    joints: dict[int, str] = field(default_factory=dict)
+    standing: list[int] = field(default_factory=list)
+
+
+def transcribe(
+    model: mujoco.MjModel, data: mujoco.MjData, varying: frozenset[int] = frozenset()
+) -> Transcription:
+    """Write the passive part of a model into a fresh spec.
+
+    Kept are the world, bodies without or with passive joints, their inertia, geoms that touch,
+    pairs and excludes, equalities among them, and the options. What stands still hangs on the world
+    here, at the pose that `data` has it at. Left out are the robot, tendons, sensors and what is
+    only seen.
+
+    Args:
+        model: any compiled model.
+        data: its state, with the kinematics run.
+        varying: bodies without a joint above them whose place changes from episode to episode;
+            they become mocap bodies, so that all copies can share one model.
+
+    Raises:
+        ValueError: it has deformable things, or geoms that a plugin shapes.
+    """
+    if model.nflex:
+        raise ValueError(
+            "the scene has deformable parts, which the object's own scene cannot have yet"
+        )
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.compiler.autolimits = False
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    copied = Transcription(spec)
+    _copy_options(model, spec)
+    meshes: dict[tuple[str, int], str] = {}
+    touching, robot = _touching(model), robot_bodies(model)
+    for body in np.flatnonzero(~robot):
+        added = _add_body(model, data, int(body), varying, copied)
+        first = int(model.body_geomadr[body])
+        for geom in range(first, first + int(model.body_geomnum[body])):
+            if touching[geom]:
+                _add_geom(model, geom, added, spec, meshes)
+    _add_contact_rules(model, copied)
+    _add_equalities(model, copied)
+    return copied
+
+
+def _copy_options(model: mujoco.MjModel, spec: mujoco.MjSpec) -> None:
+    for name in dir(model.opt):
+        if name.startswith("_"):
+            continue
+        value = getattr(model.opt, name)
+        if isinstance(value, np.ndarray):
+            getattr(spec.option, name)[:] = value
+        else:
+            setattr(spec.option, name, value)
+    # The object is pulled by a weld, whatever the scene itself does without.
+    off = mujoco.mjtDisableBit
+    spec.option.disableflags &= ~(int(off.mjDSBL_EQUALITY) | int(off.mjDSBL_CONSTRAINT))
+
+
+def _touching(model: mujoco.MjModel) -> np.ndarray:
+    """Whether each geom can touch anything, bool (ngeom,)."""
+    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    touching[model.pair_geom1] = True
+    touching[model.pair_geom2] = True
+    return touching
+
+
+def _add_body(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    body: int,
+    varying: frozenset[int],
+    copied: Transcription,
+) -> Any:
+    """Add a body with its inertia and joints; what stands still goes below the world."""
+    world = copied.spec.worldbody
+    if body == 0:
+        copied.bodies[0] = "world"
+        return world
+    name = copied.bodies[body] = model.body(body).name or f"body:{body}"
+    if model.body_weldid[body] == 0:
+        mocap = body in varying or model.body_mocapid[body] >= 0
+        added = world.add_body(
+            name=name, pos=data.xpos[body], quat=data.xquat[body], mocap=bool(mocap)
+        )
+        if mocap:
+            copied.standing.append(body)
+        return added
+    parent = copied.spec.body(copied.bodies[int(model.body_parentid[body])])
+    added = parent.add_body(name=name, pos=model.body_pos[body], quat=model.body_quat[body])
+    added.explicitinertial = True
+    added.mass = float(model.body_mass[body])
+    added.ipos[:], added.iquat[:] = model.body_ipos[body], model.body_iquat[body]
+    added.inertia[:] = model.body_inertia[body]
+    added.gravcomp = float(model.body_gravcomp[body])
+    first = int(model.body_jntadr[body])
+    for joint in range(first, first + int(model.body_jntnum[body])):
+        _add_joint(model, joint, added, copied)
+    return added
+
+
+def _add_joint(model: mujoco.MjModel, joint: int, body: Any, copied: Transcription) -> None:
+    name = copied.joints[joint] = model.joint(joint).name or f"joint:{joint}"
+    dof, adr = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
+    added = body.add_joint(
+        name=name,
+        type=mujoco.mjtJoint(int(model.jnt_type[joint])),
+        pos=model.jnt_pos[joint],
+        axis=model.jnt_axis[joint],
+        range=model.jnt_range[joint],
+        limited=int(model.jnt_limited[joint]),
+        margin=float(model.jnt_margin[joint]),
+        armature=float(model.dof_armature[dof]),
+        frictionloss=float(model.dof_frictionloss[dof]),
+        solref_limit=model.jnt_solref[joint],
+        solimp_limit=model.jnt_solimp[joint],
+        solref_friction=model.dof_solref[dof],
+        solimp_friction=model.dof_solimp[dof],
+        actgravcomp=int(model.jnt_actgravcomp[joint]),
+    )
+    if _JOINT_SIZE[int(model.jnt_type[joint])][0] == 1:
+        added.ref = float(model.qpos0[adr])
+        added.springref = float(model.qpos_spring[adr])
+    _set_polynomial(added, "stiffness", model, "jnt_stiffness", joint)
+    _set_polynomial(added, "damping", model, "dof_damping", dof)
+
+
+def _set_polynomial(joint: Any, name: str, model: mujoco.MjModel, field: str, row: int) -> None:
+    """Set what newer MuJoCo has three coefficients of, and older one."""
+    linear = float(getattr(model, field)[row])
+    if np.ndim(getattr(joint, name)) == 0:
+        setattr(joint, name, linear)
+        return
+    getattr(joint, name)[0] = linear
+    getattr(joint, name)[1:] = getattr(model, f"{field}poly")[row]
+
+
+def _add_geom(
+    model: mujoco.MjModel,
+    geom: int,
+    body: Any,
+    spec: mujoco.MjSpec,
+    meshes: dict[tuple[str, int], str],
+) -> None:
+    kind = mujoco.mjtGeom(int(model.geom_type[geom]))
+    kinds = mujoco.mjtGeom
+    if kind == kinds.mjGEOM_SDF or model.geom_plugin[geom] >= 0:
+        raise ValueError(
+            f"geom {model.geom(geom).name!r} is shaped by a plugin, which the object's own scene "
+            "cannot have"
+        )
+    added = body.add_geom(
+        name=f"geom:{geom}",
+        type=kind,
+        pos=model.geom_pos[geom],
+        quat=model.geom_quat[geom],
+        contype=int(model.geom_contype[geom]),
+        conaffinity=int(model.geom_conaffinity[geom]),
+        condim=int(model.geom_condim[geom]),
+        priority=int(model.geom_priority[geom]),
+        friction=model.geom_friction[geom],
+        solmix=float(model.geom_solmix[geom]),
+        solref=model.geom_solref[geom],
+        solimp=model.geom_solimp[geom],
+        margin=float(model.geom_margin[geom]),
+        gap=float(model.geom_gap[geom]),
+        group=int(model.geom_group[geom]),
+        rgba=model.geom_rgba[geom],
+    )
+    shape = int(model.geom_dataid[geom])
+    if kind == kinds.mjGEOM_MESH:
+        added.meshname = _mesh(model, shape, spec, meshes)
+    elif kind == kinds.mjGEOM_HFIELD:
+        added.hfieldname = _hfield(model, shape, spec, meshes)
+    else:
+        added.size[:] = model.geom_size[geom]
+
+
+def _mesh(
+    model: mujoco.MjModel, mesh: int, spec: mujoco.MjSpec, done: dict[tuple[str, int], str]
+) -> str:
+    """Add a mesh as compiled, unless it is there; its frame is the compiler's to choose again."""
+    if ("mesh", mesh) not in done:
+        vertices = slice(int(model.mesh_vertadr[mesh]), None)
+        faces = slice(int(model.mesh_faceadr[mesh]), None)
+        added = spec.add_mesh(name=f"mesh:{mesh}")
+        added.uservert = model.mesh_vert[vertices][: model.mesh_vertnum[mesh]].ravel()
+        added.userface = model.mesh_face[faces][: model.mesh_facenum[mesh]].ravel()
+        # Masses are given; of a surface that is not closed no other kind can be computed.
+        added.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        done["mesh", mesh] = added.name
+    return done["mesh", mesh]
+
+
+def _hfield(
+    model: mujoco.MjModel, field: int, spec: mujoco.MjSpec, done: dict[tuple[str, int], str]
+) -> str:
+    if ("hfield", field) not in done:
+        rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+        first = int(model.hfield_adr[field])
+        added = spec.add_hfield(name=f"hfield:{field}", nrow=rows, ncol=columns)
+        added.size[:] = model.hfield_size[field]
+        added.userdata = model.hfield_data[first : first + rows * columns].tolist()
+        done["hfield", field] = added.name
+    return done["hfield", field]
+
+
+def _add_contact_rules(model: mujoco.MjModel, copied: Transcription) -> None:
+    """Pairs of geoms and excluded pairs of bodies, of which both are kept."""
+    for pair in range(model.npair):
+        geoms = [int(model.pair_geom1[pair]), int(model.pair_geom2[pair])]
+        if all(int(model.geom_bodyid[geom]) in copied.bodies for geom in geoms):
+            copied.spec.add_pair(
+                geomname1=f"geom:{geoms[0]}",
+                geomname2=f"geom:{geoms[1]}",
+                condim=int(model.pair_dim[pair]),
+                friction=model.pair_friction[pair],
+                solref=model.pair_solref[pair],
+                solreffriction=model.pair_solreffriction[pair],
+                solimp=model.pair_solimp[pair],
+                margin=float(model.pair_margin[pair]),
+                gap=float(model.pair_gap[pair]),
+            )
+    for signature in model.exclude_signature:
+        first, second = int(signature) >> 16, int(signature) & 0xFFFF
+        if first in copied.bodies and second in copied.bodies:
+            names = copied.bodies[first], copied.bodies[second]
+            copied.spec.add_exclude(bodyname1=names[0], bodyname2=names[1])
+
+
+def _add_equalities(model: mujoco.MjModel, copied: Transcription) -> None:
+    """Equalities between kept bodies or joints."""
+    kinds = mujoco.mjtEq
+    for row in range(model.neq):
+        kind = mujoco.mjtEq(int(model.eq_type[row]))
+        of_bodies = int(model.eq_objtype[row]) == int(mujoco.mjtObj.mjOBJ_BODY)
+        known = copied.joints if kind == kinds.mjEQ_JOINT else copied.bodies
+        names = [known.get(int(ids[row])) for ids in (model.eq_obj1id, model.eq_obj2id)]
+        alone = kind == kinds.mjEQ_JOINT and int(model.eq_obj2id[row]) < 0
+        if kind not in _EQUALITIES or names[0] is None or (names[1] is None and not alone):
+            continue
+        if kind != kinds.mjEQ_JOINT and not of_bodies:
+            continue
+        added = copied.spec.add_equality(
+            type=kind,
+            objtype=mujoco.mjtObj(int(model.eq_objtype[row])),
+            name1=names[0],
+            name2="" if alone else names[1],
+            active=bool(model.eq_active0[row]),
+            solref=model.eq_solref[row],
+            solimp=model.eq_solimp[row],
+        )
+        added.data[:11] = model.eq_data[row][:11]

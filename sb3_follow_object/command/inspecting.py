@@ -1,0 +1,129 @@
+"""What `sb3-follow-object inspect` says of a task before anything trains, and what it draws."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ..any_task.derived import Derived, derived
+from ..any_task.scene_picture import draw_points
+from ..any_task.simulation import DerivedObjectVecEnv
+from ..common.reports import Report
+from ..envs import IDS
+from ..envs.registration import import_task
+from ..envs.robot_copies import robot_maker
+from .pictures import write_png
+
+_SECONDS = 1.0  # that a speed is measured for
+_COPIES = 16
+_SHOWN = 60  # starts and goals in the picture
+
+
+def inspect(env_id: str, report: Report) -> dict[str, str]:
+    """Return what is found out of a task, in words.
+
+    Args:
+        env_id: gymnasium id, with "module:" before it where importing that registers it.
+        report: told what takes long.
+
+    Raises:
+        ValueError: its object cannot be followed, with the reason.
+    """
+    name = import_task(env_id)
+    if name in IDS:
+        raise ValueError(f"{name!r} is a task of this package; inspect is for those of others")
+    found = derived(name, report)
+    return {
+        "object": _object(found),
+        "goal": _goal(found),
+        "reached": f"within {found.success_distance * 1e3:.0f} mm" + _shifted(found),
+        "varies": ", ".join(found.varying) or "nothing but object and goal",
+        "moves": "on its surface, unless it does not learn so" if found.on_surface else "freely",
+        "effector": _effector(found),
+        "episodes": f"{found.horizon} steps; the object's {found.scene.task.horizon}",
+        "steps a second": f"object {_object_speed(found):,.0f}, robot {_robot_speed(name):,.0f}",
+        "physics": found.physics,
+    }
+
+
+def draw_found(env_id: str, out: Path) -> None:
+    """Write a picture of a task with some of its starts (blue) and goals (red).
+
+    Raises:
+        MissingExtra: imageio is not installed.
+        RuntimeError: there is nothing to draw with.
+    """
+    found = derived(import_task(env_id))
+    env = robot_maker(found.env_id)()
+    try:
+        env.reset(seed=0)
+        starts, goals = found.resets.starts[:_SHOWN], found.resets.goals[:_SHOWN]
+        write_png(out, draw_points(env, starts, goals))
+    finally:
+        env.close()
+
+
+def _object(found: Derived) -> str:
+    offset = np.linalg.norm(found.object.offset)
+    point = f", a point {offset * 1e3:.0f} mm off its frame" if offset > 5e-4 else ""
+    error = f"off by {found.object.error * 1e3:.2f} mm at most"
+    if found.second is None:
+        return f"{found.object.name}{point} ({error}; nothing else can move)"
+    return f"{found.object.name}{point} ({error}; the next body by {found.second * 1e3:.0f} mm)"
+
+
+def _goal(found: Derived) -> str:
+    goals, starts = found.resets.goals, found.resets.starts
+    away = np.linalg.norm(goals - starts, axis=1)
+    up = goals[:, 2] - starts[:, 2]
+    return (
+        f"{away.min():.2f} to {away.max():.2f} m from the start, "
+        f"{up.min():.2f} to {up.max():.2f} m above it"
+    )
+
+
+def _shifted(found: Derived) -> str:
+    return "; rewards of 1 and 0 are shown as 0 and -1" if found.shifted else ""
+
+
+def _effector(found: Derived) -> str:
+    if found.effector is None:
+        return "not told in the observation"
+    return f"observation[{found.effector[0]}:{found.effector[-1] + 1}]"
+
+
+def _object_speed(found: Derived) -> float:
+    env = DerivedObjectVecEnv(found.scene, _COPIES, seed=0, on_table=found.on_surface)
+    env.reset()
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (_COPIES, 7))
+    speed = _COPIES * _rate(lambda: env.step(actions))
+    env.close()
+    return speed
+
+
+def _robot_speed(env_id: str) -> float:
+    env: gym.Env = robot_maker(env_id)()
+    env.reset(seed=0)
+
+    def step() -> None:
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            env.reset()
+
+    speed = _rate(step)
+    env.close()
+    return speed
+
+
+def _rate(call: Any) -> float:
+    """How often something can be done in a second."""
+    call()
+    started, n = time.monotonic(), 0
+    while time.monotonic() - started < _SECONDS:
+        call()
+        n += 1
+    return n / (time.monotonic() - started)

@@ -1,0 +1,231 @@
+"""An object's own environment, made of a task that nobody here wrote."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import arm_and_wall
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from test_finding import Kitchen
+
+from sb3_follow_object.any_task import derived as module
+from sb3_follow_object.any_task.derived import Derived, derived
+from sb3_follow_object.any_task.simulation import DerivedObjectVecEnv, turned_about_vertical
+from sb3_follow_object.common.cache import CACHE_VARIABLE
+
+
+class Tidy(Kitchen):
+    """A kitchen with goals on the bench or above it; the shelf stands elsewhere in each episode."""
+
+    lift = 0.0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.model.body("shelf").pos[:2] = self.np_random.uniform(0.4, 0.6, 2)
+        mujoco.mj_forward(self.model, self.data)
+        achieved = self._observation()["achieved_goal"]
+        self.goal = achieved + self.np_random.uniform([-0.1, -0.1, 0.0], [0.1, 0.1, self.lift])
+        return self._observation(), {}
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        return {**super()._observation(), "desired_goal": getattr(self, "goal", np.zeros(3))}
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, _, _, _, _ = super().step(action)
+        success = bool(self.is_success(obs["achieved_goal"], obs["desired_goal"]))
+        return obs, success - 1.0, False, False, {"is_success": success}
+
+    def is_success(self, achieved: np.ndarray, desired: np.ndarray) -> Any:
+        return np.linalg.norm(achieved - desired, axis=-1) < 0.03
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        return self.is_success(achieved, desired) - 1.0
+
+
+class Lifting(Tidy):
+    lift = 0.2
+
+
+class Massless(Tidy):
+    def __init__(self) -> None:
+        super().__init__()
+        mug = self.model.body("mug")
+        grip = self.model.body("grip")
+        self.model.body_mass[[mug.id, grip.id]] = 0.0
+
+
+class Dense(Tidy):
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        return -np.linalg.norm(achieved - desired, axis=-1)
+
+
+class Posed(Tidy):
+    def __init__(self) -> None:
+        super().__init__()
+        pose = gym.spaces.Box(-np.inf, np.inf, (7,))
+        spaces = dict(self.observation_space.spaces)  # type: ignore[attr-defined]
+        self.observation_space = gym.spaces.Dict(
+            {**spaces, "achieved_goal": pose, "desired_goal": pose}
+        )
+
+
+class NoPhysics(Tidy):
+    def __init__(self) -> None:
+        super().__init__()
+        self.physics = [self.model, self.data]  # where nobody looks
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("model", "data"):
+            return self.physics[name == "data"]
+        raise AttributeError(name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, value)
+        if name == "physics":
+            del self.__dict__["model"], self.__dict__["data"]
+
+
+KINDS = (Tidy, Lifting, Massless, Dense, Posed, NoPhysics)
+for kind in KINDS:
+    gym.register(f"{kind.__name__}-v0", kind, max_episode_steps=40, disable_env_checker=True)
+gym.register("Timeless-v0", Tidy, disable_env_checker=True)
+
+
+@pytest.fixture(autouse=True)
+def few_resets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setattr(module, "N_RESETS", 60)
+    monkeypatch.setattr(module, "_LOOKED_AT", {})
+
+
+def alone(found: Derived, n_envs: int = 3, **options: Any) -> DerivedObjectVecEnv:
+    return DerivedObjectVecEnv(found.scene, n_envs, 1, seed=0, **options)
+
+
+def test_the_tutorials_task_is_found_out() -> None:
+    found = derived(arm_and_wall.ARM)
+    assert (found.object.name, found.effector, found.horizon) == ("box", (0, 1, 2), 50)
+    assert (found.success_distance, found.on_surface, found.varying) == (0.05, True, ())
+    assert found.second is None, "nothing else can move"
+
+
+def test_episodes_begin_as_the_tasks_do() -> None:
+    found = derived(arm_and_wall.ARM)
+    env = alone(found, 30)
+    obs = env.reset()
+    for start, goal in zip(obs["achieved_goal"], obs["desired_goal"], strict=True):
+        row = int(np.argmin(np.abs(found.resets.goals - goal).sum(axis=1)))
+        np.testing.assert_array_equal(goal, found.resets.goals[row])
+        np.testing.assert_allclose(start, found.resets.starts[row], atol=1e-6)
+    assert len(np.unique(obs["achieved_goal"][:, 0])) > 15, "not the same episode again"
+    env.close()
+
+
+def test_what_stands_elsewhere_in_each_episode_does_so_here() -> None:
+    found = derived("Tidy-v0")
+    assert found.varying == ("shelf",)
+    env = alone(found)
+    env.reset()
+    shelf = int(found.scene.model.body("shelf").mocapid[0])
+    places = np.array([data.mocap_pos[shelf] for data in env.data])
+    recorded = found.resets.places[:, :, :3]
+    for place in places:
+        assert np.abs(recorded - place).max(axis=2).min() == 0.0
+    assert len(np.unique(places[:, 0])) == 3
+    env.close()
+
+
+def test_an_object_on_a_surface_keeps_height_and_tilt() -> None:
+    env = alone(derived("Tidy-v0"), 2, on_table=True)
+    env.reset()
+    first = env.simulation.read["first_pose"].copy()
+    env.step(np.ones((2, 7)))
+    np.testing.assert_array_equal(env.simulation._target_pos[:, 2], first[:, 2])
+    turn = turned_about_vertical(env.simulation._target_quat, first[:, 3:])
+    np.testing.assert_allclose(turn, env.simulation._target_quat, atol=1e-12)
+    env.close()
+
+
+def test_turns_about_the_vertical_are_all_that_is_left_of_a_turn() -> None:
+    upright = np.array([[1.0, 0.0, 0.0, 0.0]])
+    turned = turned_about_vertical(np.array([[0.9, 0.3, -0.2, 0.1]]), upright)
+    np.testing.assert_allclose(turned, [[0.9, 0.0, 0.0, 0.1]])
+    lying = np.array([[np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]])
+    np.testing.assert_allclose(turned_about_vertical(lying, lying), lying)
+
+
+def test_goals_above_the_start_are_for_an_object_that_may_leave_it() -> None:
+    assert derived("Tidy-v0").on_surface
+    assert not derived("Lifting-v0").on_surface
+
+
+def test_velocities_are_those_of_the_point_that_goals_are_about() -> None:
+    env = alone(derived("Lifting-v0"), 1)
+    before = env.reset()["observation"]
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        after = env.step(0.3 * rng.uniform(-1.0, 1.0, (1, 7)))[0]["observation"]
+    moved = []
+    for _ in range(5):
+        before, after = after, env.step(np.full((1, 7), 0.2))[0]["observation"]
+        moved.append((after[0, :3] - before[0, :3], after[0, 6:9]))
+    for displacement, velocity in moved[2:]:
+        np.testing.assert_allclose(velocity, displacement, atol=0.004)
+    env.close()
+
+
+def test_one_seed_gives_one_result_and_a_copy_goes_on_alike() -> None:
+    found = derived("Tidy-v0")
+    rng = np.random.default_rng(1)
+    actions = rng.uniform(-1.0, 1.0, (90, 3, 7))
+    one, other = alone(found), alone(found)
+    assert np.array_equal(one.reset()["observation"], other.reset()["observation"])
+    for number, action in enumerate(actions):
+        if number == 50:
+            other = copy.deepcopy(other)
+        expected, told = one.step(action), other.step(action)
+        for key, values in expected[0].items():
+            np.testing.assert_array_equal(told[0][key], values)
+    assert one.horizon == 40 and one.spec.max_episode_steps == 40
+
+
+def test_recorded_resets_are_kept_for_the_same_physics(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    first = derived("Tidy-v0", said.append)
+    assert len(said) == 1 and "60 episodes of Tidy-v0" in said[0]
+    module._LOOKED_AT.clear()
+    again = derived("Tidy-v0", said.append)
+    assert len(said) == 1 and again.physics == first.physics
+    np.testing.assert_array_equal(again.resets.goals, first.resets.goals)
+    module._LOOKED_AT.clear()
+
+    def heavier(env: Any) -> None:
+        Kitchen.__init__(env)
+        env.model.body("mug").mass[0] = 0.5
+
+    monkeypatch.setattr(Tidy, "__init__", heavier)
+    other = derived("Tidy-v0", said.append)
+    assert len(said) == 2 and other.physics != first.physics
+
+
+@pytest.mark.parametrize(
+    ("env_id", "sentence"),
+    [
+        ("Massless-v0", "'Massless-v0': the object 'mug' has no mass, so nothing can pull it"),
+        ("Dense-v0", "'Dense-v0': it pays -?0 on the goal and -17.3205 far from it; the rewards"),
+        ("Posed-v0", r"'Posed-v0': goals must be positions of the shape \(3,\), not \(7,\)"),
+        ("NoPhysics-v0", "'NoPhysics-v0': NoPhysics holds no MuJoCo simulation"),
+        ("Timeless-v0", "'Timeless-v0': it does not say how long its episodes are; register it"),
+        ("CartPole-v1", "CartPole-v1 has no goals: .*; say with goal= and is_success="),
+        ("Nowhere-v0", "there is no environment 'Nowhere-v0'"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused_in_one_sentence(env_id: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence) as caught:
+        derived(env_id)
+    assert "\n" not in str(caught.value)

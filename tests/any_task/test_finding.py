@@ -1,0 +1,122 @@
+"""The object is found by watching, and what cannot be followed is refused with a reason."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import arm_and_wall
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from scenes import kitchen
+
+from sb3_follow_object.any_task.finding import Observed, find_effector, find_object, observe
+from sb3_follow_object.envs.registration import import_task
+
+
+class Kitchen(gym.Env):
+    """The kitchen with a goal for a point of one of its bodies; its things lie anew each time."""
+
+    def __init__(self, body: str = "grip", offset: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
+        self.model, self.data = kitchen()
+        self.body, self.offset = body, np.array(offset)
+        box = gym.spaces.Box(-np.inf, np.inf, (3,))
+        keys = ("observation", "achieved_goal", "desired_goal")
+        self.observation_space = gym.spaces.Dict(dict.fromkeys(keys, box))
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        for joint in (2, 3):  # the mug's and the empty root's
+            place = self.data.joint(joint).qpos
+            place[:2] += self.np_random.uniform(-0.05, 0.05, 2)
+            place[3:] = self.np_random.normal(size=4)
+            place[3:] /= np.linalg.norm(place[3:])
+        mujoco.mj_forward(self.model, self.data)
+        return self._observation(), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, 5)
+        return self._observation(), -1.0, False, False, {}
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        body = self.data.body(self.body)
+        achieved = body.xpos + body.xmat.reshape(3, 3) @ self.offset
+        tip = self.data.site("tip").xpos.copy()
+        return {"observation": tip, "achieved_goal": achieved, "desired_goal": np.zeros(3)}
+
+
+@pytest.fixture(scope="module")
+def arm() -> Iterator[Observed]:
+    env = gym.make(arm_and_wall.ARM)
+    yield observe(env)
+    env.close()
+
+
+def test_the_tutorials_box_is_found(arm: Observed) -> None:
+    found = find_object(arm)
+    assert (found.name, found.of_robot) == ("box", False)
+    assert found.error < 1e-6 and np.abs(found.offset).max() < 1e-6
+    assert find_effector(arm) == (0, 1, 2)
+
+
+def test_a_point_off_a_body_is_mapped_to_the_body_with_the_joint() -> None:
+    seen = observe(Kitchen("grip", (0.01, 0.02, 0.03)))
+    found = find_object(seen)
+    assert seen.model.body(found.body).name == "mug"
+    np.testing.assert_allclose(found.offset, [0.01, 0.05, 0.04], atol=1e-9)
+
+
+def test_a_drawers_handle_is_followed_like_an_object() -> None:
+    env = Kitchen("handle")
+    seen = observe(env)
+    assert seen.model.body(find_object(seen).body).name == "drawer", "though nothing touched it"
+    assert find_object(seen, "handle").body == find_object(seen).body
+
+
+def test_the_effector_is_a_point_of_the_robot_in_the_observation() -> None:
+    assert find_effector(observe(Kitchen())) == (0, 1, 2)
+
+
+@pytest.mark.parametrize(
+    ("body", "wanted", "sentence"),
+    [
+        ("arm", None, r"a point of the robot itself \(arm\): there is no object to follow"),
+        ("bench", None, "no body moves with the achieved goal .*is off by"),
+        (
+            "grip",
+            "load",
+            "does not move with 'load': it is off by .* the nearest body is mug",
+        ),
+        ("grip", "arm", "'arm' is a part of the robot"),
+        ("grip", "shelf", "'shelf' has no joint"),
+        ("grip", "cup", "no body 'cup'; those that can move are .*mug"),
+    ],
+)
+def test_what_is_no_object_is_refused(body: str, wanted: str | None, sentence: str) -> None:
+    seen = observe(Kitchen(body, (0.1, 0.1, 0.1)))
+    with pytest.raises(ValueError, match=sentence):
+        find_object(seen, wanted)
+
+
+def test_bodies_that_move_alike_are_told_apart_by_their_name() -> None:
+    env = Kitchen("mug")
+    seen = observe(env)
+    twin = seen.model.body("empty root").id
+    seen.positions[:, twin] = seen.positions[:, seen.model.body("mug").id]
+    seen.rotations[:, twin] = seen.rotations[:, seen.model.body("mug").id]
+    with pytest.raises(ValueError, match=r"several bodies move with .*: mug, empty root; name one"):
+        find_object(seen)
+    assert find_object(seen, "empty root").name == "empty root"
+
+
+def test_a_gripper_that_is_the_goal_is_refused() -> None:
+    import_task("FetchReach-v4")
+    env = gym.make("FetchReach-v4")
+    with pytest.raises(ValueError, match="train it with --method her"):
+        find_object(observe(env))
+    env.close()

@@ -1,0 +1,65 @@
+"""Functions that make environments, or say their goals, get ids like any other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import arm_and_wall
+import gymnasium as gym
+import numpy as np
+import pytest
+import toy
+from gymnasium.wrappers import TimeLimit
+
+from sb3_follow_object.any_task.registering import registered
+from sb3_follow_object.envs.robot_copies import robot_maker
+
+
+def make_my_arm() -> gym.Env:
+    return TimeLimit(arm_and_wall.ArmAndWall(), 30)  # type: ignore[attr-defined]
+
+
+def elsewhere(env: Any, obs: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    return obs["achieved_goal"], obs["desired_goal"] + [0.0, 0.0, 0.1]
+
+
+def near(achieved: np.ndarray, desired: np.ndarray) -> Any:
+    return np.linalg.norm(achieved - desired, axis=-1) < 0.02
+
+
+def test_a_function_gets_an_id_with_its_time_limit() -> None:
+    env_id = registered(make_env=make_my_arm, object="box")
+    assert env_id == "Followed/make_my_arm-v0"
+    assert gym.spec(env_id).max_episode_steps == 30
+    env = robot_maker(env_id)()
+    assert env.get_wrapper_attr("followed_object") == "box"
+    env.close()
+
+
+def test_goals_of_an_id_are_what_the_functions_say() -> None:
+    env_id = registered(arm_and_wall.ARM, goal=elsewhere, is_success=near)
+    assert env_id == "Followed/ArmAndWall-v0"
+    env = robot_maker(env_id)()
+    obs, _ = env.reset(seed=0)
+    assert obs["desired_goal"][2] == pytest.approx(0.125)
+    assert env.get_wrapper_attr("is_success")(obs["desired_goal"], obs["desired_goal"])
+    assert env.step(np.zeros(3))[1] == -1.0
+    env.close()
+
+
+def test_an_id_alone_stays_what_it_is() -> None:
+    assert registered("FetchPush-v4") == "FetchPush-v4"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({}, "give an environment's id, or make_env"),
+        ({"env_id": "FetchPush-v4", "make_env": make_my_arm}, "give an environment's id, or make"),
+        ({"make_env": toy.PointEnv}, "PointEnv-v0 does not say how long its episodes are"),
+        ({"env_id": "Nowhere-v0", "object": "box"}, "there is no environment 'Nowhere-v0'"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(arguments: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        registered(**arguments)

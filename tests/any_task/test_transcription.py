@@ -1,0 +1,138 @@
+"""What moves without the robot moves in its own scene as it does in the whole one."""
+
+from __future__ import annotations
+
+import arm_and_wall
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from scenes import kitchen, throw
+
+from sb3_follow_object.any_task.physics_access import physics_of
+from sb3_follow_object.any_task.robot_parts import body_name, robot_bodies
+from sb3_follow_object.any_task.scene import PULLER, pull
+from sb3_follow_object.any_task.transcription import transcribe
+from sb3_follow_object.envs.registration import import_task
+
+TENTH_OF_MM = 1e-4
+SECONDS = 0.6
+
+
+def passive(
+    model: mujoco.MjModel, data: mujoco.MjData, varying: frozenset[int] = frozenset()
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The object's own scene and a state of it with every kept joint where it is in the whole."""
+    copied = transcribe(model, data, varying)
+    alone = copied.spec.compile()
+    state = mujoco.MjData(alone)
+    for joint, name in copied.joints.items():
+        state.joint(name).qpos = data.joint(joint).qpos
+        state.joint(name).qvel = data.joint(joint).qvel
+    return alone, state
+
+
+@pytest.mark.parametrize("env_id", ["FetchPickAndPlace-v4", "FetchPush-v4", "FetchSlide-v4"])
+def test_an_object_thrown_in_anothers_environment_moves_alike(env_id: str) -> None:
+    import_task(env_id)
+    env = gym.make(env_id)
+    env.reset(seed=1)
+    model, data = physics_of(env)
+    alone, state = passive(model, data)
+    thrown = np.array([0.2, 0.4, 1.0, 1.0, 2.0, 3.0])
+    model.geom_contype[robot_bodies(model)[model.geom_bodyid]] = 0  # the arm is in the way
+    model.geom_conaffinity[robot_bodies(model)[model.geom_bodyid]] = 0
+    whole = throw(model, data, "object0:joint", thrown, SECONDS)
+    path = throw(alone, state, "object0:joint", thrown, SECONDS)
+    assert np.ptp(whole, axis=0).max() > 0.05, "it was thrown"
+    limit = 3e-4 if env_id == "FetchSlide-v4" else TENTH_OF_MM
+    assert np.linalg.norm(whole - path, axis=1).max() <= limit
+    env.close()
+
+
+def test_a_box_thrown_at_the_tutorials_wall_moves_alike() -> None:
+    env = gym.make(arm_and_wall.ARM)
+    env.reset(seed=2)
+    model, data = physics_of(env)
+    alone, state = passive(model, data)
+    joint = int(model.body("box").jntadr[0])
+    data.joint(joint).qpos[:2] = state.joint(0).qpos[:2] = 0.38, -0.1
+    thrown = np.array([0.0, 1.5, 0.0, 0.0, 0.0, 1.0])
+    data.joint(joint).qvel = state.joint(0).qvel = thrown
+    for _ in range(round(SECONDS / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+        mujoco.mj_step(alone, state)
+        assert np.linalg.norm(data.joint(joint).qpos[:3] - state.qpos[:3]) <= TENTH_OF_MM
+    assert state.qpos[1] < -0.02, "the wall has stopped it"
+
+
+@pytest.mark.parametrize(
+    ("joint", "velocity"),
+    [
+        ("rail", np.array([0.8])),
+        (3, np.array([-0.3, -0.6, 0.5, 2.0, 1.0, 0.0])),
+    ],
+    ids=["a drawer with a spring", "a root without mass"],
+)
+def test_passive_joints_of_every_kind_are_kept(joint: str | int, velocity: np.ndarray) -> None:
+    model, data = kitchen()
+    copied = transcribe(model, data)
+    name = joint if isinstance(joint, str) else copied.joints[joint]
+    alone, state = passive(model, data)
+    if isinstance(joint, int):
+        data.joint(joint).qvel = velocity
+        state.joint(name).qvel = velocity
+    else:
+        data.joint(joint).qvel = state.joint(name).qvel = velocity
+    for _ in range(round(SECONDS / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+        mujoco.mj_step(alone, state)
+    for old, new in copied.joints.items():
+        np.testing.assert_allclose(state.joint(new).qpos, data.joint(old).qpos, atol=TENTH_OF_MM)
+
+
+def test_a_robot_is_what_hangs_on_the_first_joint_that_is_driven() -> None:
+    model, _ = kitchen()
+    robot = {body_name(model, int(body)) for body in np.flatnonzero(robot_bodies(model))}
+    assert robot == {"arm"}, "not the bench on its root, nor the drawer, nor a free mocap body"
+
+
+def test_a_mocap_body_that_pulls_a_robot_goes_with_it() -> None:
+    import_task("FetchPush-v4")
+    env = gym.make("FetchPush-v4")
+    model, _ = physics_of(env)
+    kept = [body_name(model, int(b)) for b in np.flatnonzero(~robot_bodies(model))]
+    assert kept == ["world", "floor0", "table0", "object0"]
+    env.close()
+
+
+def test_what_stands_elsewhere_in_each_episode_becomes_a_mocap_body() -> None:
+    model, data = kitchen()
+    shelf, bench = model.body("shelf").id, model.body("bench").id
+    alone, state = passive(model, data, frozenset([shelf]))
+    assert alone.body("shelf").mocapid[0] >= 0 > alone.body("bench").mocapid[0]
+    np.testing.assert_allclose(alone.body("bench").pos, data.xpos[bench])
+    top = "geom:1"
+    mocap = int(alone.body("shelf").mocapid[0])
+    state.mocap_pos[mocap] = (0.45, 0.05, 0.23)  # under the mug
+    mujoco.mj_forward(alone, state)
+    touched = {tuple(sorted((c.geom1, c.geom2))) for c in state.contact[: state.ncon]}
+    mug = int(alone.body("mug").geomadr[0])
+    assert (int(alone.body("shelf").geomadr[0]), mug) in touched
+    assert alone.geom(top).type == mujoco.mjtGeom.mjGEOM_BOX
+
+
+def test_a_weld_pulls_the_part_that_has_the_mass() -> None:
+    model, data = kitchen()
+    copied = transcribe(model, data)
+    pull(copied.spec, "load")
+    alone = copied.spec.compile()
+    state = mujoco.MjData(alone)
+    mujoco.mj_forward(alone, state)
+    load, puller = alone.body("load").id, int(alone.body(PULLER).mocapid[0])
+    for _ in range(20):
+        state.mocap_pos[puller] = state.xpos[load] + [0.0, 0.0, 0.05]
+        state.mocap_quat[puller] = state.xquat[load]
+        before = state.xpos[load][2]
+        mujoco.mj_step(alone, state, 20)
+    assert state.xpos[load][2] - before > 0.02, "it follows within a step of 0.04 s"

@@ -1,0 +1,75 @@
+"""`inspect` says what is found in a task of others and draws it, or why it cannot, in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import arm_and_wall
+import pytest
+
+from sb3_follow_object.any_task import derived as looking
+from sb3_follow_object.command import inspecting
+from sb3_follow_object.command.cli import main
+from sb3_follow_object.command.pictures import draw_task
+from sb3_follow_object.common.cache import CACHE_VARIABLE
+
+ARM = f"arm_and_wall:{arm_and_wall.ARM}"
+
+
+@pytest.fixture(autouse=True)
+def few_resets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr(looking, "N_RESETS", 60)
+    monkeypatch.setattr(looking, "_LOOKED_AT", {})
+    monkeypatch.setattr(inspecting, "_SECONDS", 0.01)
+
+
+def test_it_says_what_is_found(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", "--env", ARM]) == 0
+    told = capsys.readouterr()
+    facts = dict(line.split("  ", 1) for line in told.out.splitlines())
+    facts = {name: words.strip() for name, words in facts.items()}
+    assert facts["object"] == "box (off by 0.00 mm at most; nothing else can move)"
+    assert facts["reached"] == "within 50 mm"
+    assert facts["effector"] == "observation[0:3]"
+    assert facts["moves"].startswith("on its surface")
+    assert facts["episodes"] == "50 steps; the object's 50"
+    assert "where 60 episodes of ArmAndWall-v0 begin is recorded, once" in told.err
+
+
+def test_it_draws_starts_and_goals(can_draw: None, tmp_path: Path) -> None:
+    imageio = pytest.importorskip("imageio.v3")
+    out = tmp_path / "arm.png"
+    assert main(["inspect", "--env", ARM, "--out", str(out)]) == 0
+    image = imageio.imread(out).astype(int)
+    assert image.shape == (480, 480, 3)
+    red, green, blue = (image[..., channel] for channel in range(3))
+    assert ((red > 2 * green) & (red > 2 * blue) & (red > 40)).sum() > 100, "goals"
+    assert ((blue > 2 * red) & (blue > 40)).sum() > 100, "starts"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "sentence"),
+    [
+        ("FetchReach-v4", "'FetchReach-v4': the achieved goal is a point of the robot itself"),
+        ("FollowObject/PnPShelf-v0", "'FollowObject/PnPShelf-v0' is a task of this package"),
+        ("Nowhere-v0", "there is no environment 'Nowhere-v0'"),
+        ("nowhere:Arm-v0", "names a module that cannot be imported"),
+    ],
+)
+def test_why_nothing_is_found_is_one_line(
+    env_id: str, sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["inspect", "--env", env_id]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and told.err.count("\n") == 1 and sentence in told.err
+
+
+def test_an_environment_that_draws_nothing_is_filmed_all_the_same(
+    can_draw: None, tmp_path: Path
+) -> None:
+    imageio = pytest.importorskip("imageio.v3")
+    out = tmp_path / "task.png"
+    draw_task(ARM, out)
+    image = imageio.imread(out).astype(int)
+    assert image.shape == (480, 480, 3) and image.max() > 40

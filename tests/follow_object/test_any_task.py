@@ -1,0 +1,117 @@
+"""All three stages in an environment that nobody here wrote."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import arm_and_wall
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from small_models import weights
+from stable_baselines3.common.callbacks import BaseCallback
+from tiny_runs import TINY, quiet
+
+from sb3_follow_object.any_task import derived as looking
+from sb3_follow_object.common.cache import CACHE_VARIABLE
+from sb3_follow_object.follow_object.follow_object import FollowObject
+from sb3_follow_object.object_stage import stage as stages
+from sb3_follow_object.object_stage.policy import StopWhenSolved
+from sb3_follow_object.settings.presets import run_config
+
+ARM = arm_and_wall.ARM
+
+
+@pytest.fixture(autouse=True)
+def few_resets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr(looking, "N_RESETS", 60)
+    monkeypatch.setattr(looking, "_LOOKED_AT", {})
+
+
+def test_a_save_goes_on_as_the_whole_does(tmp_path: Path) -> None:
+    settings = {**TINY, "reach": {}}
+    whole = FollowObject(ARM, **settings).learn(3200)
+    part = FollowObject(ARM, **settings).learn(2800)
+    assert part.model is not None and part.settings["reach"]["effector"] == (0, 1, 2)
+    assert part.predictor is not None and part.predictor.object_on_table
+    part.save(tmp_path / "part")
+    resumed = FollowObject.load(tmp_path / "part").learn(3200)
+    assert whole.model is not None and resumed.model is not None
+    assert resumed.env_steps == whole.env_steps > part.env_steps
+    th.testing.assert_close(weights(resumed.model), weights(whole.model), rtol=0, atol=0)
+
+
+def test_an_object_that_does_not_learn_on_its_surface_may_leave_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(stages, "SURFACE_STEPS", 400)
+    settings = {**TINY, "object_timesteps": 1200}
+    states: list[dict[str, Any]] = []
+
+    class Keep(BaseCallback):
+        def __init__(self, solved: StopWhenSolved) -> None:
+            super().__init__()
+            self.solved = solved
+
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_rollout_start(self) -> None:
+            states.append(copy.deepcopy(self.solved.state_dict()))
+
+    said: list[str] = []
+    run = FollowObject(ARM, report=said.append, **settings)
+    stage = run.object_stage
+    predictor = stage.learn_predictor(Keep)
+    assert stage.on_table is False and predictor.object_on_table is False
+    assert stage.policy_steps == 400 + 1200, "both trials are counted"
+    assert sum("may leave it from here on" in sentence for sentence in said) == 1
+    # On from a checkpoint of the first trial, and of the second.
+    for state in (states[0], states[-2]):
+        again = FollowObject(ARM, report=quiet, **settings).object_stage
+        resumed = again.learn_predictor(state=state)
+        assert again.policy_steps == stage.policy_steps
+        np.testing.assert_array_equal(resumed.error_mm, predictor.error_mm)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"lift": "maybe"}, "lift must be True, False or \"auto\", not 'maybe'"),
+        ({"lift": True, "object_on_table": False}, "lift and object_on_table say the same"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(arguments: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        FollowObject(ARM, **TINY, **arguments)
+
+
+def test_lift_is_the_users_word() -> None:
+    assert FollowObject(ARM, **TINY, lift=True).object_stage._choices() == (False,)
+    assert FollowObject(ARM, **TINY, lift=False).object_stage._choices() == (True,)
+    assert FollowObject(ARM, **TINY).object_stage._choices() == (True, False)
+
+
+class Near(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
+    def is_success(self, achieved: np.ndarray, desired: np.ndarray) -> Any:
+        return np.linalg.norm(achieved - desired, axis=-1) < 0.02
+
+
+gym.register("Near-v0", Near, max_episode_steps=50)
+
+
+def test_presets_set_a_task_up_as_the_packages_most_similar_one() -> None:
+    pushed = run_config("FollowObject/PushSideGap-v0").settings
+    settings = run_config(ARM).settings
+    assert settings["algorithm"] == pushed["algorithm"]
+    assert settings["object_algorithm"] == pushed["object_algorithm"]
+    near = run_config("Near-v0").settings
+    assert near["curriculum"]["min_distance"] == pytest.approx(0.022)
+    replay = near["algorithm"]["replay_buffer_kwargs"]
+    assert (replay["moved_distance"], replay["min_goal_distance"]) == (0.02, 0.02)
+    given = run_config("Near-v0", overrides={"curriculum.min_distance": 0.5}).settings
+    assert given["curriculum"]["min_distance"] == 0.5
