@@ -40,7 +40,7 @@ def physics_of(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData]:
         todo.extend((value, depth + 1) for value in _attributes(thing))
     raise ValueError(
         f"{type(env.unwrapped).__name__} holds no MuJoCo simulation (mujoco.MjModel and MjData); "
-        "the object's own scene can only be made from one"
+        "the object's own scene can only be made from one; train it with --method her"
     )
 
 

@@ -221,7 +221,7 @@ def test_recorded_resets_are_kept_for_the_same_physics(monkeypatch: pytest.Monke
         ("Posed-v0", r"'Posed-v0': goals must be positions of the shape \(3,\), not \(7,\)"),
         ("NoPhysics-v0", "'NoPhysics-v0': NoPhysics holds no MuJoCo simulation"),
         ("Timeless-v0", "'Timeless-v0': it does not say how long its episodes are; register it"),
-        ("CartPole-v1", "CartPole-v1 has no goals: .*; say with goal= and is_success="),
+        ("CartPole-v1", "'CartPole-v1': there are no goals: .*; say with goal= and is_success="),
         ("Nowhere-v0", "there is no environment 'Nowhere-v0'"),
     ],
 )

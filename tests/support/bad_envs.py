@@ -62,8 +62,8 @@ class NoSuccess(toy.PointEnv):
     compute_reward = is_success = None  # type: ignore[assignment]
 
     def step(self, action: np.ndarray) -> Any:
-        obs, reward, terminated, truncated, _ = super().step(action)
-        return obs, reward, terminated, truncated, {}
+        self.steps += 1
+        return self._observe(), -1.0, False, self.steps >= toy.HORIZON, {}
 
 
 class NoReward(toy.PointEnv):
