@@ -61,11 +61,17 @@ def robot_vec_env(env_id: str, n_envs: int, n_threads: int | None = None, **opti
 def robot_maker(env_id: str, **options: Any) -> Callable[[], gym.Env]:
     """Return what makes one copy of a registered task, with what it lacks of `RobotTask`."""
     spec = gym.spec(import_task(env_id))
-    probe = gym.make(spec, **options)
     try:
-        wrapped = may_be_faced(probe) and needs_face(probe)
-    finally:
-        probe.close()
+        probe = gym.make(spec, **options)
+        try:
+            wrapped = may_be_faced(probe) and needs_face(probe)
+        finally:
+            probe.close()
+    except ValueError:
+        raise
+    except Exception as error:  # an environment of somebody's may raise anything
+        said = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{env_id!r} cannot be made and begun: {said}") from error
     return partial(_make, spec, wrapped, options)
 
 

@@ -29,8 +29,8 @@ _CHECKED = (1, 7)  # batch sizes
 def export_onnx(model: Any, path: str | os.PathLike[str]) -> float:
     """Write a policy as an ONNX file that acts as `predict(..., deterministic=True)` does.
 
-    The file has an input for each key of the observation, named as the key, (batch, *shape)
-    float32 where the space holds floats, and one output "action", (batch, *shape). What the policy
+    The file has an input for each key of the observation, named as the key, `(batch, *shape)`
+    float32 where the space holds floats, and one output "action", `(batch, *shape)`. What a policy
     does to observations is inside, and so is the clipping of actions; a VecNormalize around the
     environment is not the policy's and stays outside. The file is compared with `predict` by
     ONNX Runtime before it takes its name.

@@ -28,6 +28,7 @@ def evaluate(
     n_episodes: int = 380,
     seed: int = 0,
     between_steps: Callable[[], None] = lambda: None,
+    n_threads: int | None = None,
 ) -> Episodes:
     """Test a saved policy: original goals, no noise, fresh episodes (section 5.2).
 
@@ -39,12 +40,13 @@ def evaluate(
         n_episodes: at least 1.
         seed: of the run.
         between_steps: called after each step; may raise to stop.
+        n_threads: threads or processes that step the copies; None takes one a core.
 
     Raises:
         ValueError: the file is missing, damaged or for other observations or actions, or
             `n_episodes` below 1.
     """
-    env = evaluation_env(env_id, stream_seed(seed, "final test"))
+    env = evaluation_env(env_id, stream_seed(seed, "final test"), n_threads)
     try:
         space = env.observation_space
         actor, _ = load_actor(policy_file, space, env.action_space)  # type: ignore[arg-type]

@@ -192,6 +192,7 @@ class RunStages:
             self.config.n_final_episodes,
             self.config.seed,
             self.stop.check,
+            self.run.settings["n_threads"],
         )
         result = {
             "task": self.config.env_id.removeprefix("FollowObject/").removesuffix("-v0"),

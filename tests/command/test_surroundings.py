@@ -153,7 +153,7 @@ def test_a_run_goes_on_without_a_reader() -> None:
 @pytest.mark.parametrize("module", ["sb3_follow_object", "sb3_follow_object.command.cli"])
 def test_modules_are_the_command(module: str) -> None:
     status, out, _ = command("--help", module=module)
-    assert status == 0 and out.startswith("usage: sb3-follow-object [-h] COMMAND")
+    assert status == 0 and out.startswith("usage: sb3-follow-object [-h] [--version]")
     status, out, err = command(module=module)
     assert (status, out) == (2, "") and err.startswith("sb3-follow-object: the following argum")
 
