@@ -103,7 +103,8 @@ class Approach:
         self._steps += 1
         near = np.linalg.norm(effector - self._target(), axis=1) <= tolerance
         arrived = near & ~self._above
-        self._above &= ~near
+        # Not every effector gets so high: after half of its steps it goes for the place itself.
+        self._above &= ~near & (2 * self._steps < self.settings.max_steps)
         self.reaching &= ~arrived & (self._steps < self.settings.max_steps)
         np.add.at(self.counts, (self.began[dones].astype(int), self.came[dones].astype(int)), 1)
 

@@ -155,6 +155,15 @@ def test_reaching_gives_up_after_its_steps(face: str) -> None:
     np.testing.assert_array_equal(way[2], way[1])
 
 
+@pytest.mark.parametrize("face", FACES)
+def test_an_effector_that_cannot_get_above_the_object_goes_to_it_after_half_its_steps(
+    face: str,
+) -> None:
+    env = FACES[face](height=100.0, max_steps=6)
+    climbed = np.diff(effectors(env, 6)[:, :, 2], axis=0)
+    assert (climbed[:2] > 0.0).all() and (climbed[2:] < 0.0).all()
+
+
 def imagined_batch() -> VecEnv:
     venv = DummyVecEnv([lambda: gym.make(TASK)] * 3)
     return ImaginedGoalVecEnv(venv, BentPredictor(), toy.Curriculum(HORIZON, p=1.0))
