@@ -182,16 +182,21 @@ def object_only(spec: mujoco.MjSpec, body_name: str) -> mujoco.MjSpec:
 
     mocap = f"{body_name}:mocap"
     spec.worldbody.add_body(name=mocap, mocap=True, pos=body.pos, quat=body.quat)
+    weld_to(spec, mocap, body_name)
+    return spec
+
+
+def weld_to(spec: mujoco.MjSpec, mocap: str, body: str) -> None:
+    """Let a mocap body of a spec pull another of its bodies along."""
     weld = spec.add_equality(
         type=mujoco.mjtEq.mjEQ_WELD,
         objtype=mujoco.mjtObj.mjOBJ_BODY,
         name1=mocap,
-        name2=body_name,
+        name2=body,
         solref=[0.02, 1.0],
         solimp=[0.9, 0.95, 0.001, 0.5, 2.0],
     )
     weld.data[:11] = [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]  # same pose, torque scale 1
-    return spec
 
 
 def strip_visuals(spec: mujoco.MjSpec) -> mujoco.MjSpec:

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from ..envs.physics_engine import mujoco
+from ..envs.scene import weld_to
 from .resets import Resets, varying_bodies
 from .robot_parts import rigid_group
-from .transcription import Transcription, transcribe
+from .transcription import JOINT_SIZE, Transcription, transcribe
 
 STEP = 0.04  # seconds of an env step, as in the package's own tasks
 POINT, PULLER = "followed:point", "followed:mocap"
-_SIZES = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
 _LEAST_MASS = 1e-9  # kg
 # What decides the object's motion and does not change from episode to episode.
 _PHYSICS = (
@@ -99,7 +99,8 @@ def object_scene_of(
     heavy = _heaviest(model, body)
     spec = copied.spec
     spec.body(copied.bodies[body]).add_site(name=POINT, pos=offset)
-    pull(spec, copied.bodies[heavy])
+    spec.worldbody.add_body(name=PULLER, mocap=True)
+    weld_to(spec, PULLER, copied.bodies[heavy])
     alone = spec.compile()
     substeps = max(1, round(STEP / alone.opt.timestep))
     positions, velocities = _places_in(model, alone, copied)
@@ -114,20 +115,6 @@ def object_scene_of(
         substeps,
         success_distance,
     )
-
-
-def pull(spec: mujoco.MjSpec, body: str) -> None:
-    """Weld a body of a spec to a new mocap body."""
-    spec.worldbody.add_body(name=PULLER, mocap=True)
-    weld = spec.add_equality(
-        type=mujoco.mjtEq.mjEQ_WELD,
-        objtype=mujoco.mjtObj.mjOBJ_BODY,
-        name1=PULLER,
-        name2=body,
-        solref=[0.02, 1.0],
-        solimp=[0.9, 0.95, 0.001, 0.5, 2.0],
-    )
-    weld.data[:11] = [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]  # same pose, torque scale 1
 
 
 def physics_digest_of(
@@ -181,7 +168,7 @@ def _places_in(
     positions, velocities = np.zeros(alone.nq, dtype=int), np.zeros(alone.nv, dtype=int)
     for joint, name in copied.joints.items():
         new = alone.joint(name).id
-        n_pos, n_vel = _SIZES[int(model.jnt_type[joint])]
+        n_pos, n_vel = JOINT_SIZE[int(model.jnt_type[joint])]
         pos, vel = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         new_pos, new_vel = int(alone.jnt_qposadr[new]), int(alone.jnt_dofadr[new])
         positions[new_pos : new_pos + n_pos] = np.arange(pos, pos + n_pos)

@@ -14,7 +14,7 @@ import numpy as np
 from ..envs.physics_engine import mujoco
 from .robot_parts import robot_bodies
 
-_JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
+JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
 _EQUALITIES = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_JOINT)
 
 
@@ -152,7 +152,7 @@ def _add_joint(model: mujoco.MjModel, joint: int, body: Any, copied: Transcripti
         solimp_friction=model.dof_solimp[dof],
         actgravcomp=int(model.jnt_actgravcomp[joint]),
     )
-    if _JOINT_SIZE[int(model.jnt_type[joint])][0] == 1:
+    if JOINT_SIZE[int(model.jnt_type[joint])][0] == 1:
         added.ref = float(model.qpos0[adr])
         added.springref = float(model.qpos_spring[adr])
     _set_polynomial(added, "stiffness", model, "jnt_stiffness", joint)

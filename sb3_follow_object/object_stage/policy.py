@@ -10,7 +10,6 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..any_task.tasks import surface_choices
 from ..callbacks.copyable import CopyableCallback
 from ..callbacks.rollout import run_episodes
 from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
@@ -167,16 +166,6 @@ def train_object_policy(
             reset_num_timesteps=state is None,
         )
     return model, solved
-
-
-def keeps_object_on_table(env_id: str, setting: bool | None = None) -> bool:
-    """Whether the object may not leave the table in the first stage, as `surface_choices` begins.
-
-    Args:
-        env_id: a task.
-        setting: None decides by the task.
-    """
-    return surface_choices(env_id, setting)[0]
 
 
 def collect_paths(model: Any, env: VecEnv, n_episodes: int) -> ObjectPaths:

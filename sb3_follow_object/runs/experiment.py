@@ -15,7 +15,6 @@ from ..follow_object.follow_object import FollowObject
 from ..settings.run_config import RunConfig
 from ..settings.sizes import check_sizes, idle_robot
 from .checkpoints import Checkpoints, checkpoint_files
-from .evaluation import evaluate as evaluate  # where it was until it had a file of its own
 from .run_callbacks import Progress, StopSignals
 from .run_folder import check_empty, check_same_run, claim, finished_result, take_steps
 from .stages import RunStages

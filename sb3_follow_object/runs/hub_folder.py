@@ -15,10 +15,10 @@ from stable_baselines3.td3.policies import Actor
 
 from ..common.files import atomic_write
 from ..ddpg.actor_files import load_actor
-from ..envs import make_vec
+from ..envs.robot_copies import robot_vec_env
 from ..settings.presets import load_config
 from ..settings.run_config import CONFIG, RunConfig
-from .experiment import evaluate
+from .evaluation import evaluate
 from .run_folder import POLICY, RESULT, VERSIONS
 
 # The names that SB3's users know from the hub.
@@ -117,7 +117,7 @@ def load_hub_folder(folder: str | os.PathLike[str]) -> tuple[Actor, RunConfig]:
         raise ValueError(
             f"{config.env_id!r} is registered by importing {config.module}: import it first"
         )
-    env = make_vec(config.env_id, 1)
+    env = robot_vec_env(config.env_id, 1)
     try:
         space = env.observation_space
         return load_actor(folder / POLICY, space, env.action_space)[0], config

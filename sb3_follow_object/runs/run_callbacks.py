@@ -120,8 +120,8 @@ class RunCallback(BaseCallback):
         evaluation: OriginalGoalEvalCallback,
         folder: Path,
         progress: Progress,
-        solved_at: float = 0.0,
-        solved_validations: int = 1,
+        solved_at: float,
+        solved_validations: int,
     ):
         super().__init__()
         self.run = run

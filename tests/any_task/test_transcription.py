@@ -11,9 +11,10 @@ from scenes import kitchen, throw
 
 from sb3_follow_object.any_task.physics_access import physics_of
 from sb3_follow_object.any_task.robot_parts import body_name, robot_bodies
-from sb3_follow_object.any_task.scene import PULLER, pull
+from sb3_follow_object.any_task.scene import PULLER
 from sb3_follow_object.any_task.transcription import transcribe
 from sb3_follow_object.envs.registration import import_task
+from sb3_follow_object.envs.scene import weld_to
 
 TENTH_OF_MM = 1e-4
 SECONDS = 0.6
@@ -125,7 +126,8 @@ def test_what_stands_elsewhere_in_each_episode_becomes_a_mocap_body() -> None:
 def test_a_weld_pulls_the_part_that_has_the_mass() -> None:
     model, data = kitchen()
     copied = transcribe(model, data)
-    pull(copied.spec, "load")
+    copied.spec.worldbody.add_body(name=PULLER, mocap=True)
+    weld_to(copied.spec, PULLER, "load")
     alone = copied.spec.compile()
     state = mujoco.MjData(alone)
     mujoco.mj_forward(alone, state)

@@ -14,7 +14,7 @@ from sb3_follow_object.command import demo
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.ddpg.actor_files import load_actor
 from sb3_follow_object.envs import TASKS, make_vec
-from sb3_follow_object.runs.experiment import evaluate
+from sb3_follow_object.runs.evaluation import evaluate
 
 pytestmark = pytest.mark.xdist_group("wheel")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import arm_and_wall
+import imageio.v3 as imageio
 import pytest
 
 from sb3_follow_object.any_task import derived as looking
@@ -38,7 +39,6 @@ def test_it_says_what_is_found(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_it_draws_starts_and_goals(can_draw: None, tmp_path: Path) -> None:
-    imageio = pytest.importorskip("imageio.v3")
     out = tmp_path / "arm.png"
     assert main(["inspect", "--env", ARM, "--out", str(out)]) == 0
     image = imageio.imread(out).astype(int)
@@ -68,7 +68,6 @@ def test_why_nothing_is_found_is_one_line(
 def test_an_environment_that_draws_nothing_is_filmed_all_the_same(
     can_draw: None, tmp_path: Path
 ) -> None:
-    imageio = pytest.importorskip("imageio.v3")
     out = tmp_path / "task.png"
     draw_task(ARM, out)
     image = imageio.imread(out).astype(int)
