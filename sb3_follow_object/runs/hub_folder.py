@@ -120,7 +120,8 @@ def load_hub_folder(folder: str | os.PathLike[str]) -> tuple[Actor, RunConfig]:
     env = robot_vec_env(config.env_id, 1)
     try:
         space = env.observation_space
-        return load_actor(folder / POLICY, space, env.action_space)[0], config
+        actor, _ = load_actor(folder / POLICY, space, env.action_space)  # type: ignore[arg-type]
+        return actor, config
     finally:
         env.close()
 
