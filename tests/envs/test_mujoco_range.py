@@ -10,8 +10,6 @@ import pytest
 from packaging.requirements import Requirement
 from tree import ROOT, run
 
-pytestmark = pytest.mark.xdist_group("wheel")
-
 SMOKE = """
 import gymnasium as gym
 import gymnasium_robotics
