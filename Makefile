@@ -22,10 +22,11 @@ QUICK := tests/settings tests/imagination tests/callbacks/test_callbacks.py test
 	tests/ddpg/test_her_ddpg.py
 
 quick: lint
-	$(BIN)/pytest -q -n 2 --dist loadgroup -k "not learns and not stock and not subprocesses" $(QUICK)
+	$(BIN)/pytest -q -n 2 --dist loadfile -k "not learns and not stock and not subprocesses" $(QUICK)
 
+# Whole files go to a process, so that what their tests share is made once.
 test: lint
-	$(BIN)/pytest -q -n 2 --dist loadgroup
+	$(BIN)/pytest -q -n 2 --dist loadfile
 
 # Builds throwaway environments with the lowest and the highest mujoco that pyproject.toml admits.
 test-mujoco-range: $(INSTALLED)

@@ -27,8 +27,6 @@ from sb3_follow_object.runs.predictor_cache import CACHE_VARIABLE, get_predictor
 from sb3_follow_object.runs.progress import ProgressBar, Terminal
 from sb3_follow_object.runs.run_folder import check_empty
 
-pytestmark = pytest.mark.xdist_group("cli")  # the tests share one run
-
 TASK = "FollowObject/PushSideGap-v0"
 START = ["train", "--env", TASK, "--steps", "3000", "--n-envs", "2", "--threads", "1"]
 START += ["--seed", "3", "--set", *TINY]

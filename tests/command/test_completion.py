@@ -45,7 +45,6 @@ def test_bash_completes_a_command_and_its_option(
     assert complete("sb3-follow-object", "export", "--on") == ["--onnx"]
 
 
-@pytest.mark.xdist_group("wheel")
 def test_installed_command_and_module_say_the_packages_version(
     tmp_path: Path, bare_python: Callable[..., Path]
 ) -> None:

@@ -16,8 +16,6 @@ from sb3_follow_object.ddpg.actor_files import load_actor
 from sb3_follow_object.envs import TASKS, make_vec
 from sb3_follow_object.runs.evaluation import evaluate
 
-pytestmark = pytest.mark.xdist_group("wheel")
-
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_has_a_policy(task: str) -> None:

@@ -21,8 +21,6 @@ from sb3_follow_object.comparison import compare, figures
 from sb3_follow_object.runs import experiment, stages
 from sb3_follow_object.runs.progress import ProgressBar, Terminal
 
-pytestmark = pytest.mark.xdist_group("surroundings")  # the tests share one run
-
 PICTURES = ("curve.png", "task.png", "video.mp4")
 OF_GRAPHICS = {"MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM"}
 

@@ -18,8 +18,6 @@ from sb3_follow_object.comparison import ray_executor
 from sb3_follow_object.comparison.ray_executor import RayExecutor, _write_files
 from sb3_follow_object.comparison.worker import TRAIN, Job
 
-pytestmark = pytest.mark.xdist_group("ray")  # the tests share one cluster
-
 TINY = ["policy_kwargs.net_arch=[8]", "batch_size=16", "gradient_steps=2", "n_envs=2"]
 TINY += ["object_timesteps=800", "n_paths=8", "predictor_fit.epochs=1", "predictor_fit.hidden=[8]"]
 TINY += ["object_algorithm.policy_kwargs.net_arch=[8]", "object_algorithm.batch_size=16"]

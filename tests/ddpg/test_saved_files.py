@@ -20,8 +20,6 @@ from sb3_follow_object.ddpg.actor_files import save_actor
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.ddpg.policies import HerPolicy
 
-pytestmark = pytest.mark.xdist_group("saved files")  # the tests share one process
-
 SEEN = {key: np.full((5, 3), 0.1) for key in ("observation", "achieved_goal", "desired_goal")}
 LOADER = """
 import sys

@@ -18,8 +18,6 @@ from sb3_follow_object.command.cli import _COMMANDS
 from sb3_follow_object.envs.task_table import BUILT_IN, TASKS
 from sb3_follow_object.settings.methods import METHODS
 
-pytestmark = pytest.mark.xdist_group("site")
-
 NAMES = [
     f"{module.__name__}.{name}"
     for module in (sb3_follow_object, sb3_follow_object.envs)

@@ -13,8 +13,6 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 from tree import ROOT, run
 
-pytestmark = pytest.mark.xdist_group("wheel")
-
 # Random steps of every task: prints mujoco's version, keeps where gripper, object and goal came to.
 STEPS = """
 import sys

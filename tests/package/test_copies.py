@@ -75,7 +75,6 @@ def verdicts(request: pytest.FixtureRequest) -> dict[str, str]:
     return found
 
 
-@pytest.mark.xdist_group("copies elsewhere")  # they share two processes
 @pytest.mark.parametrize("name", THINGS)
 def test_another_process_goes_on_as_this_one(name: str, verdicts: dict[str, str]) -> None:
     assert verdicts[name] == "equal"

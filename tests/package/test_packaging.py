@@ -9,8 +9,6 @@ from tree import PACKAGES, run
 
 import sb3_follow_object
 
-pytestmark = pytest.mark.xdist_group("wheel")
-
 USER_SCRIPT = """
 import gymnasium as gym
 from sb3_follow_object import FollowObject

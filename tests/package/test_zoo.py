@@ -21,7 +21,6 @@ from sb3_follow_object.envs import TASKS
 from sb3_follow_object.runs.predictor_cache import CACHE_VARIABLE
 
 pytest.importorskip("rl_zoo3")
-pytestmark = pytest.mark.xdist_group("zoo")  # of one process, which imports rl_zoo3 once
 
 CONFIGS = PACKAGES["sb3_follow_object/zoo_configs"]
 STOCK = ["--gym-packages", "sb3_follow_object"]

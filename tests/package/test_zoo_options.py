@@ -22,7 +22,6 @@ from sb3_follow_object import zoo
 from sb3_follow_object.runs.predictor_cache import CACHE_VARIABLE
 
 pytest.importorskip("rl_zoo3")
-pytestmark = pytest.mark.xdist_group("zoo")  # the tests share one run
 
 NAME = "FollowObject-PushSideGap-v0"
 RUN = f"logs/her_ddpg/{NAME}_1"

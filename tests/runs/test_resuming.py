@@ -26,8 +26,6 @@ from sb3_follow_object.runs.experiment import train
 from sb3_follow_object.runs.run_callbacks import StopSignals
 from sb3_follow_object.runs.run_folder import CROSS_TESTS
 
-pytestmark = pytest.mark.xdist_group("resuming")  # the tests share one run
-
 # What a run says as it comes to each stage, the final test last.
 STAGES = ("checkpoint at 400 env", "stage 2", "checkpoint at 2600 env", "final test")
 
