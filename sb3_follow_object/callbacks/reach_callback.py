@@ -22,10 +22,11 @@ class ReachCallback(CopyableCallback):
     """Teach the reach policy after each rollout and carry it into the environments.
 
     Where the effector is and when it has arrived it takes from the environment's wrapper. A rollout
-    that ends no episode teaches nothing. The share of episodes that begin with reaching falls as
-    the learner's own episodes come to the place by themselves; while it is nothing the reach policy
-    learns no more. Records reach/share, reach/success (of episodes that begin with reaching) and
-    reach/own_success (of all others). It keeps what it has learned when another training begins.
+    that ends no episode teaches nothing. The reach policy learns the less the fewer of its episodes
+    fail. The share of episodes that begin with reaching falls as the learner's own episodes come to
+    the place by themselves; while it is nothing the reach policy learns no more. Records
+    reach/share, reach/success (of episodes that begin with reaching) and reach/own_success (of all
+    others). It keeps what it has learned when another training begins.
 
     Args:
         seed: of the reach policy; None draws one from NumPy's global stream, which SB3 seeds.
@@ -57,6 +58,11 @@ class ReachCallback(CopyableCallback):
         learned = self.own_success if self.settings.fade else 0.0
         share = self.settings.share * (1.0 - learned)
         return share if share >= _LEAST_SHARE else 0.0
+
+    @property
+    def n_updates(self) -> int:
+        """Gradient steps that the reach policy takes after a rollout now."""
+        return max(1, round(self.settings.n_updates * (1.0 - self.success)))
 
     def _on_training_start(self) -> None:
         if not self._is_wrapped():
@@ -102,7 +108,7 @@ class ReachCallback(CopyableCallback):
         assert self.policy is not None
         buffer: Any = self.model.replay_buffer  # type: ignore[attr-defined]
         if self.share and buffer.is_ready():
-            self.policy.learn(buffer, self.settings.n_updates, self.settings.batch_size)
+            self.policy.learn(buffer, self.n_updates, self.settings.batch_size)
         if self.policy.has_learned:
             self._carry(self.policy)
 

@@ -99,7 +99,12 @@ class ReachTeachingSettings(Group):
         Flag, setting("whether the share falls as the learner comes to the object by itself")
     ] = True
     n_updates: Annotated[
-        Whole, setting("gradient steps of the reach policy after a rollout", ge=1)
+        Whole,
+        setting(
+            "gradient steps of the reach policy after a rollout while all that it does fails; as "
+            "many fewer as it succeeds",
+            ge=1,
+        ),
     ] = 120
     batch_size: Annotated[Whole, setting("transitions of each of them", ge=1, le=10**6)] = 256
 

@@ -215,6 +215,20 @@ def test_faded_policy_learns_and_reaches_no_more(monkeypatch: pytest.MonkeyPatch
     assert callback.policy._n_updates == 2 * TINY["n_updates"] and not effectors_move(env)
 
 
+def test_a_policy_that_arrives_learns_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = ReachFirstVecEnv(DummyVecEnv([lambda: gym.make(TASK)] * N), **REACH)
+    model, callback = learner(env), ReachCallback(n_updates=8, batch_size=16)
+    monkeypatch.setattr(callback, "_count", lambda: None)
+    taken = []
+    for success in (0.0, 0.5, 1.0):
+        callback.success = success
+        before = callback.policy._n_updates if callback.policy is not None else 0
+        model.learn(N * HORIZON, callback, reset_num_timesteps=False)
+        assert callback.policy is not None
+        taken.append(callback.policy._n_updates - before)
+    assert taken == [8, 4, 1]
+
+
 def test_it_teaches_once_an_episode_has_ended_however_short_the_rollouts() -> None:
     env = DummyVecEnv([reaching_env])
     model = learner(env, "DDPG", train_freq=4, gradient_steps=1, learning_starts=HORIZON)
