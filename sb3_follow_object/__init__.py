@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from .ddpg.actor_files import load_actor as load_actor
     from .ddpg.actor_files import save_actor as save_actor
     from .ddpg.auxiliary import AuxiliaryReward as AuxiliaryReward
+    from .ddpg.goal_policy import GoalPolicy as GoalPolicy
     from .ddpg.her_ddpg import HerDDPG as HerDDPG
+    from .ddpg.layer_norm import LayerNormReLU as LayerNormReLU
     from .ddpg.onnx_files import export_onnx as export_onnx
     from .ddpg.policies import HerPolicy as HerPolicy
     from .envs import make_vec as make_vec
@@ -49,11 +51,13 @@ _HOME = {
     "CurriculumCallback": "callbacks.curriculum_callback",
     "FollowObject": "follow_object.follow_object",
     "FollowObjectReplayBuffer": "replay.her_replay_buffer",
+    "GoalPolicy": "ddpg.goal_policy",
     "GoalPredictor": "imagination.goal_predictor",
     "HerDDPG": "ddpg.her_ddpg",
     "HerPolicy": "ddpg.policies",
     "ImaginedGoalVecEnv": "imagination.vec_env",
     "ImaginedGoalWrapper": "imagination.wrapper",
+    "LayerNormReLU": "ddpg.layer_norm",
     "ObjectNetworks": "object_stage.networks",
     "OriginalGoalEvalCallback": "callbacks.eval_callback",
     "ReachCallback": "callbacks.reach_callback",

@@ -1,4 +1,4 @@
-"""LayerNorm whose gradients do not depend on the number of PyTorch's threads."""
+"""LayerNorm: its gradients do not depend on the number of threads; as an activation for SB3."""
 
 from __future__ import annotations
 
@@ -25,6 +25,18 @@ class LayerNorm(nn.LayerNorm):
             return super().forward(x)
         y: th.Tensor = _LayerNorm.apply(x, self.normalized_shape, self.weight, self.bias, self.eps)
         return y
+
+
+class LayerNormReLU(nn.Module):
+    """ReLU of standardised inputs: brings LayerNorm into any network of SB3, as its activation_fn.
+
+    It has no weights, so it needs no widths: SB3 makes activations without arguments. Sparse
+    rewards let critics overestimate without end where nothing holds them; this does.
+    """
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """Standardise each row of (n, width) and cut off what is below its mean."""
+        return th.relu(nn.functional.layer_norm(x, x.shape[-1:]))
 
 
 class _LayerNorm(th.autograd.Function):

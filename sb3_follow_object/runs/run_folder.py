@@ -80,12 +80,17 @@ def claim(folder: Path, config: RunConfig, command: str = "") -> None:
     """Create a run's folder with its config and versions: what `train(resume=True)` asks for."""
     folder.mkdir(parents=True, exist_ok=True)
     check_empty(folder)  # again, now that no other process can come in between
-    versions: dict[str, str | None] = {n: importlib.metadata.version(n) for n in PACKAGES}
-    versions |= {"python": platform.python_version(), "commit": source_commit()}
-    atomic_write(folder / VERSIONS, json.dumps(versions, indent=2).encode())
+    write_versions(folder)
     if command:
         atomic_write(folder / COMMAND, f"{command}\n".encode())
     atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
+
+
+def write_versions(folder: Path) -> None:
+    """Note in a folder what its results depend on besides its settings."""
+    versions: dict[str, str | None] = {n: importlib.metadata.version(n) for n in PACKAGES}
+    versions |= {"python": platform.python_version(), "commit": source_commit()}
+    atomic_write(folder / VERSIONS, json.dumps(versions, indent=2).encode())
 
 
 def take_steps(folder: Path, config: RunConfig, command: str = "") -> None:

@@ -53,8 +53,10 @@ def _gradient_steps(value: Any) -> int:
 
 
 def _target_clip(value: Any) -> Any:
-    if isinstance(value, str) and value == "auto":
-        return "auto"
+    return "auto" if isinstance(value, str) and value == "auto" else _bounds(value)
+
+
+def _bounds(value: Any) -> tuple[float, float]:
     if not isinstance(value, list | tuple) or len(value) != 2:
         raise ValueError
     low, high = (as_number(limit) for limit in value)
@@ -117,6 +119,7 @@ GradientSteps = Annotated[
     BeforeValidator(_gradient_steps),
     Said("a whole number of at least 1, or -1 for the steps of a rollout"),
 ]
+Bounds = Annotated[Any, BeforeValidator(_bounds), Said("(low, high) with low <= high or None")]
 TargetClip = Annotated[
     Any, BeforeValidator(_target_clip), Said('(low, high) with low <= high, "auto" or None')
 ]

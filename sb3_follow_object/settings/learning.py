@@ -11,6 +11,7 @@ from ..common.suggestions import did_you_mean
 from .fields import Anything, Flag, Group, Number, Text, Whole, checked, setting
 from .kinds import (
     CRITICS_LIMIT,
+    Bounds,
     Device,
     GradientSteps,
     Hidden,
@@ -182,6 +183,19 @@ class PolicySettings(Group):
     features_extractor_kwargs: Annotated[Any, setting("HerPolicy brings its own", data=False)] = (
         None
     )
+
+
+@dataclass(frozen=True)
+class GoalPolicySettings(Group):
+    """The networks of stock DDPG and TD3."""
+
+    title = "`policy_kwargs`, of `GoalPolicy`"
+    action_l2: Annotated[
+        Number, setting("weight of the mean squared action in the actor's loss", ge=0)
+    ] = 1.0
+    target_clip: Annotated[
+        Bounds | None, setting("bounds of what the target critic says", none="none")
+    ] = None
 
 
 @dataclass(frozen=True)

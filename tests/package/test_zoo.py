@@ -137,28 +137,41 @@ def test_her_ddpg_trains_and_plays(method: str, n_envs: int, cache: Path, folder
         assert "Success rate:" in play(stock=False, fresh=fresh)
 
 
-@pytest.mark.parametrize("algorithm", ["ddpg", "tqc"])
-def test_stock_algorithms_reach_first(algorithm: str, cache: Path, folder: Path) -> None:
-    entry = yaml.safe_load((CONFIGS / "ddpg.yml").read_text())["default"]
-    entry["env_wrapper"].append({"sb3_follow_object.ReachFirstWrapper": {"height": 0.05}})
-    teaching = {"share": 1.0, "n_updates": 2, "batch_size": 16}
-    entry["callback"].insert(0, {"sb3_follow_object.ReachCallback": teaching})
-    (folder / "reach.yml").write_text(yaml.safe_dump({TASK: entry}))
+@pytest.mark.parametrize(("algorithm", "file"), [("td3", "ddpg.yml"), ("sac", "sac.yml")])
+def test_a_file_serves_two_stock_algorithms(
+    algorithm: str, file: str, cache: Path, folder: Path
+) -> None:
     stock = ["--algo", algorithm, *STOCK]
-    steps = one_test("ddpg.yml", 2)
-    out = train(cache, *stock, "--conf-file", "reach.yml", stock=True, n_envs=2, steps=steps)
+    conf = ["--conf-file", str(CONFIGS / file)]
+    out = train(cache, *stock, *conf, stock=True, n_envs=2, steps=one_test(file, 2))
     for name in ("share", "own_success", "k_max", "test_success"):
         assert name in out
     check_run(folder / "logs" / algorithm / "FollowObject-PushSideGap-v0_1", 2)
     assert "Success rate:" in play(*stock, stock=True)
 
 
-def test_ddpg_file_has_every_task_with_its_horizon() -> None:
-    entries = yaml.safe_load((CONFIGS / "ddpg.yml").read_text())
+@pytest.mark.parametrize("file", ["ddpg.yml", "sac.yml"])
+def test_stock_files_say_what_the_preset_says(file: str) -> None:
+    stock = yaml.safe_load((CONFIGS / file).read_text())
+    own = yaml.safe_load((CONFIGS / "fo.yml").read_text())
+    for name in TASKS:
+        env_id = f"FollowObject/{name}-v0"
+        entry, preset = stock.get(env_id, stock["default"]), own.get(env_id, own["default"])
+        for key in ("env_wrapper", "callback", "n_envs", "batch_size", "gradient_steps", "tau"):
+            assert entry[key] == preset[key], (name, key)
+        given = dict(entry["replay_buffer_kwargs"])
+        assert given.pop("n_sampled_goal") == 4 and given == preset["replay_buffer_kwargs"]
+
+
+@pytest.mark.parametrize("file", ["ddpg.yml", "sac.yml"])
+def test_stock_files_have_every_task_with_its_horizon(file: str) -> None:
+    entries = yaml.safe_load((CONFIGS / file).read_text())
     for name, task in TASKS.items():
         entry = entries.get(f"FollowObject/{name}-v0", entries["default"])
         assert entry["train_freq"] == task.horizon
         assert entry["gamma"] == pytest.approx(1.0 - 1.0 / task.horizon)
+        if file == "ddpg.yml":
+            assert entry["policy_kwargs"]["target_clip"] == [-task.horizon, 0]
 
 
 @pytest.mark.parametrize("arguments", [[], ["fly"], ["--algo", "her_ddpg"]])

@@ -1,0 +1,110 @@
+"""A policy for stock DDPG and TD3 with what keeps them learning from sparse rewards of -1 and 0."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.td3.policies import Actor, TD3Policy
+
+from ..common.torch_helpers import WholeModule, usual_defaults
+from ..settings.learning import GoalPolicySettings
+from .policies import LayerNormCritic
+
+
+class GoalPolicy(WholeModule, TD3Policy):
+    """TD3Policy whose critic neither overestimates without end nor drives actions to their limits.
+
+    Stock algorithms have no setting for the three things that `HerDDPG` does about that, so they
+    are in the networks: LayerNorm in the critics, targets within the returns that rewards can sum
+    up to, and a price on large actions. Inputs are left to VecNormalize.
+
+    Args:
+        action_l2: weight, >= 0, of the mean squared action in the actor's loss; it comes in with
+            the gradient, so that the algorithm's own loss stays as it is.
+        target_clip: (low, high), bounds of what the target critic says; for rewards of -1 and 0
+            they are -1/(1 - gamma) and 0. None, none.
+
+    The other arguments are TD3Policy's.
+
+    Raises:
+        ValueError: an argument outside its range.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        action_l2: float = GoalPolicySettings.action_l2,
+        target_clip: tuple[float, float] | None = GoalPolicySettings.target_clip,
+        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ):
+        settings = GoalPolicySettings(action_l2=action_l2, target_clip=target_clip)
+        if kwargs.get("optimizer_class", th.optim.Adam) in (th.optim.Adam, th.optim.AdamW):
+            optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
+        self.action_l2 = settings.action_l2
+        self.target_clip = settings.target_clip
+        with usual_defaults():
+            super().__init__(
+                observation_space,
+                action_space,
+                lr_schedule,
+                net_arch=[256, 256, 256] if net_arch is None else net_arch,
+                features_extractor_class=features_extractor_class,
+                optimizer_kwargs=optimizer_kwargs,
+                **kwargs,
+            )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {"action_l2": self.action_l2, "target_clip": self.target_clip}
+        return {**super()._get_constructor_parameters(), **own}
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        assert isinstance(self.critic_target, _BoundedCritic)
+        self.critic_target.bounds = self.target_clip
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """Build the actor (or its target)."""
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        actor = _PricedActor(**kwargs).to(self.device)
+        actor.action_l2 = self.action_l2
+        return actor
+
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> ContinuousCritic:
+        """Build the critics (or their targets)."""
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return _BoundedCritic(**kwargs).to(self.device)
+
+
+class _PricedActor(Actor):
+    """The gradient of what follows has that of `action_l2` times the mean squared action added."""
+
+    action_l2 = 0.0
+
+    def forward(self, obs: Any) -> th.Tensor:
+        actions = super().forward(obs)
+        if actions.requires_grad and self.action_l2:
+            price = 2.0 * self.action_l2 / actions.numel() * actions.detach()
+            actions.register_hook(lambda gradient: gradient + price)
+        return actions
+
+
+class _BoundedCritic(LayerNormCritic):
+    """What the critics say is kept within bounds, where there are any."""
+
+    bounds: tuple[float, float] | None = None
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        values = super().forward(obs, actions)
+        return values if self.bounds is None else tuple(q.clamp(*self.bounds) for q in values)
