@@ -226,12 +226,13 @@ def test_a_predictor_for_another_task_is_refused(cache: Path) -> None:
 
 def test_the_script_in_the_docs_runs(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sb3.md").read_text(), re.DOTALL)
-    script, batch = blocks
-    assert len(script.strip().splitlines()) <= 13
-    assert script.count("1_000_000") == 1
-    output = run([sys.executable, "-c", script.replace("1_000_000", "1_200")], cwd=tmp_path)
-    assert "test_success" in output and "k_max" in output
-    assert (tmp_path / "side_gap.zip").exists()
-    exec(batch, names := {})
-    assert names["env"].num_envs == 16
+    script, single = blocks
+    assert len(script.strip().splitlines()) <= 22
+    for written, tried in (("300_000", "4_900"), ("PnPShelf", "PushSideGap")):
+        assert script.count(written) == 1
+        script = script.replace(written, tried)
+    output = run([sys.executable, "-c", script], cwd=tmp_path)
+    assert "test_success" in output and "k_max" in output and "critic_loss" in output
+    assert (tmp_path / "shelf.zip").exists()
+    exec(single, names := {})
     names["env"].close()
