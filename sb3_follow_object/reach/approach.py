@@ -19,6 +19,7 @@ Observation = dict[str, np.ndarray]
 STREAM = 0x5EAC  # parts the reaching's random numbers from those of the environment's own seed
 AHEAD = 0.1  # metres of the object's way, whose end says where it shall go next
 BEHIND = 0.06  # metres, the standoff where objects are pushed
+ABOVE, TO_PLACE, PUSH = 0, 1, 2  # legs of the effector's way
 
 
 class Approach:
@@ -26,7 +27,8 @@ class Approach:
 
     The effector is taken above the place that it shall reach, then down to it, and from there on
     the learner acts. The place is the object itself or, with a `standoff`, behind the object as
-    seen from where it shall go.
+    seen from where it shall go; then it goes on to the same distance behind there, and so pushes
+    the object some of the way.
 
     Args:
         n_envs: copies.
@@ -51,7 +53,8 @@ class Approach:
         self.began = np.zeros(n_envs, dtype=bool)  # with reaching
         self.came = np.zeros(n_envs, dtype=bool)  # to the place, by reaching or by itself
         self._place = np.zeros((n_envs, 3))
-        self._above = np.zeros(n_envs, dtype=bool)
+        self._push = np.zeros((n_envs, 3))  # from the place on, zero where nothing is pushed
+        self._leg = np.zeros(n_envs, dtype=np.int64)  # of the way: above, to the place, the push
         self._steps = np.zeros(n_envs, dtype=np.int64)
         # What the entries of actions do that reaching does not need, drawn for an episode.
         self._idle = np.zeros((n_envs, *action_space.shape))
@@ -68,7 +71,7 @@ class Approach:
         chosen = self.rng.random(len(rows)) < self.share
         self._idle[rows] = self.rng.uniform(-1.0, 1.0, self._idle[rows].shape)
         self.began[rows] = self.reaching[rows] = chosen & (self.actor is not None)
-        self._above[rows] = self.settings.height > 0.0
+        self._leg[rows] = ABOVE if self.settings.height > 0.0 else TO_PLACE
         self._steps[rows] = 0
         self.came[rows] = False
         place = np.array(obs["achieved_goal"][rows], dtype=np.float64)
@@ -77,6 +80,7 @@ class Approach:
             way[:, 2] = 0.0
             length = np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
             place -= self.settings.standoff * way / length
+            self._push[rows] = way * np.minimum(1.0, AHEAD / length)
         self._place[rows] = place
 
     def act(self, obs: Observation, actions: np.ndarray) -> np.ndarray:
@@ -102,23 +106,25 @@ class Approach:
         self.came |= np.linalg.norm(effector - self._place, axis=1) <= tolerance
         self._steps += 1
         near = np.linalg.norm(effector - self._target(), axis=1) <= tolerance
-        arrived = near & ~self._above
+        last = PUSH if self.settings.standoff > 0.0 else TO_PLACE
+        arrived = near & (self._leg == last)
         # Not every effector gets so high: after half of its steps it goes for the place itself.
-        self._above &= ~near & (2 * self._steps < self.settings.max_steps)
+        late = (self._leg == ABOVE) & (2 * self._steps >= self.settings.max_steps)
+        self._leg += (near & ~arrived) | late
         self.reaching &= ~arrived & (self._steps < self.settings.max_steps)
         np.add.at(self.counts, (self.began[dones].astype(int), self.came[dones].astype(int)), 1)
 
     def _target(self) -> np.ndarray:
         target = self._place.copy()
-        target[:, 2] += self.settings.height * self._above
-        return target
+        target[:, 2] += self.settings.height * (self._leg == ABOVE)
+        return target + self._push * (self._leg == PUSH)[:, None]
 
     def take_counts(self) -> np.ndarray:
         """Return `counts` since the last call."""
         counts, self.counts = self.counts, np.zeros((2, 2), dtype=np.int64)
         return counts
 
-    _ARRAYS = ("reaching", "began", "came", "_place", "_above", "_steps", "_idle", "counts")
+    _ARRAYS = ("reaching", "began", "came", "_place", "_push", "_leg", "_steps", "_idle", "counts")
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that running and coming episodes depend on; the actor comes apart."""

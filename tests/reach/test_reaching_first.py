@@ -182,8 +182,15 @@ STANDING: dict[str, Callable[..., VecEnv]] = {
 }
 
 
+def effector_way(env: VecEnv) -> np.ndarray:
+    """Where the effectors are in an episode but its last step, (steps, 3, 3)."""
+    stand = np.zeros((3, 4), np.float32)
+    steps: list[Any] = [env.step(stand)[0] for _ in range(HORIZON - 1)]
+    return np.array([obs["observation"][:, :3] for obs in steps])
+
+
 @pytest.mark.parametrize("face", STANDING)
-def test_with_a_standoff_the_place_is_behind_the_object_as_its_path_goes(face: str) -> None:
+def test_with_a_standoff_it_goes_behind_the_object_and_on_as_its_path_goes(face: str) -> None:
     env = STANDING[face](**QUIET, standoff=0.08)
     env.seed(0)
     if isinstance(env, ReachFirstVecEnv):
@@ -191,23 +198,38 @@ def test_with_a_standoff_the_place_is_behind_the_object_as_its_path_goes(face: s
     else:
         env.env_method("set_reach", StraightActor(), 1.0)
     objects = env.reset()["achieved_goal"].copy()
-    stand = np.zeros((3, 4), np.float32)
-    for _ in range(HORIZON - 1):
-        obs: Any = env.step(stand)[0]
-    place = objects - [0.08, 0.0, 0.0]
-    distance = np.linalg.norm(obs["observation"][:, :3] - place, axis=1)
-    assert (distance <= QUIET["tolerance"]).all()
+    way = effector_way(env)
+    behind, end = objects - [0.08, 0.0, 0.0], objects + [0.02, 0.0, 0.0]
+    to_place = np.linalg.norm(way - behind, axis=2)
+    to_end = np.linalg.norm(way - end, axis=2)
+    assert (to_place.min(axis=0) <= QUIET["tolerance"]).all()
+    assert (to_end[-1] <= QUIET["tolerance"]).all()
+    assert (to_place.argmin(axis=0) < to_end.argmin(axis=0)).all()
 
 
 def test_without_imagined_goals_it_is_behind_as_the_goal_lies() -> None:
     env = batched(standoff=0.08)
     obs = {key: value.copy() for key, value in env.reset().items()}  # type: ignore[union-attr]
-    way = obs["desired_goal"] - obs["achieved_goal"]
-    place = obs["achieved_goal"] - 0.08 * way / np.linalg.norm(way, axis=1, keepdims=True)
-    for _ in range(HORIZON - 1):
-        last: Any = env.step(np.zeros((3, 4), np.float32))[0]
-    distance = np.linalg.norm(last["observation"][:, :3] - place, axis=1)
-    assert (distance <= QUIET["tolerance"]).all()
+    to_goal = obs["desired_goal"] - obs["achieved_goal"]
+    length = np.linalg.norm(to_goal, axis=1, keepdims=True)
+    place = obs["achieved_goal"] - 0.08 * to_goal / length
+    end = place + np.minimum(0.1, length) * to_goal / length
+    way = effector_way(env)
+    assert (np.linalg.norm(way - place, axis=2).min(axis=0) <= QUIET["tolerance"]).all()
+    assert (np.linalg.norm(way[-1] - end, axis=1) <= QUIET["tolerance"]).all()
+
+
+def test_a_cube_on_the_table_is_pushed_some_of_its_way() -> None:
+    curriculum = toy.Curriculum(HORIZON, p=1.0)
+    venv = ImaginedGoalVecEnv(make_vec(PUSH, 4, 1), BentPredictor(), curriculum)
+    env = ReachFirstVecEnv(venv, noise=0.0, max_steps=40)
+    env.seed(0)
+    env.set_reach(StraightActor(), 1.0)
+    before = env.reset()["achieved_goal"].copy()  # type: ignore[call-overload]
+    for _ in range(45):
+        obs: Any = env.step(np.zeros((4, 4), np.float32))[0]
+    moved = obs["achieved_goal"] - before
+    assert (moved[:, 0] > 0.04).all() and (np.abs(moved[:, 1]) < 0.03).all()
 
 
 @pytest.mark.parametrize(("env_id", "metres"), [(PUSH, BEHIND), (PICK, 0.0), (TASK, 0.0)])
