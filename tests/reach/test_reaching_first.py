@@ -199,7 +199,7 @@ def test_with_a_standoff_it_goes_behind_the_object_and_on_as_its_path_goes(face:
         env.env_method("set_reach", StraightActor(), 1.0)
     objects = env.reset()["achieved_goal"].copy()
     way = effector_way(env)
-    behind, end = objects - [0.08, 0.0, 0.0], objects + [0.02, 0.0, 0.0]
+    behind, end = objects - [0.08, 0.0, 0.0], objects + np.array([0.02, 0.0, 0.0])
     to_place = np.linalg.norm(way - behind, axis=2)
     to_end = np.linalg.norm(way - end, axis=2)
     assert (to_place.min(axis=0) <= QUIET["tolerance"]).all()
