@@ -121,9 +121,9 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True, help="a new folder")
     options = parser.parse_args()
     options.run.mkdir(parents=True)
+    write_versions(options.run)
     seconds = train(options)
     row = result(options, seconds)
-    write_versions(options.run)
     (options.run / "result.json").write_text(json.dumps(row, indent=1) + "\n")
     print(f"{row['success_rate']:.3f} of {row['episodes']} after {row['env_steps']} env steps")
 
