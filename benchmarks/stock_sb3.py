@@ -70,7 +70,7 @@ def final_test(folder: Path, options: argparse.Namespace) -> tuple[Episodes, Bas
         env = VecNormalize.load(str(statistics), env)
         env.training = False
     file = folder / f"{options.env.replace('/', '-')}.zip"
-    model = ALGOS[options.algo].load(file, env=None, custom_objects={"replay_buffer_class": None})
+    model = ALGOS[options.algo].load(file, env=env)
     episodes = run_episodes(
         lambda obs: model.predict(obs, deterministic=True)[0],  # type: ignore[arg-type]
         env,
