@@ -2,11 +2,10 @@
 
     python benchmarks/collect.py runs/*
 
-A row of summary.csv is replaced by a run of the same task, method and seed. Each run's policy,
-predictor, configuration, versions and learning curve are copied beside it, so that
-`sb3-follow-object evaluate benchmarks/results/<run>` tests it again. The tables of README and of
-docs/results.md are drawn from summary.csv: medians over seeds. The figures and the tables of final
-success are drawn from the copied runs.
+A run takes the place of one of the same task, method and seed. Its policy, configuration, versions
+and learning curve are copied: `sb3-follow-object evaluate benchmarks/results/<run>` tests it again;
+runs of benchmarks/stock_sb3.py have no policy file. Everything else is made of the copied
+runs: summary.csv, the tables of README and of docs/results.md (medians over seeds), the figures.
 """
 
 from __future__ import annotations
@@ -57,16 +56,15 @@ def read_row(run: Path) -> dict[str, str]:
     return {column: str(result[column]) for column in COLUMNS}
 
 
-def keep_files(run: Path, row: dict[str, str]) -> None:
-    """Copy what evaluating and plotting the run again needs."""
+def keep_files(run: Path) -> None:
+    """Copy what evaluating and plotting a run again needs."""
+    row = read_row(run)
     target = RESULTS / f"{row['task']}-{row['method']}-{row['seed']}"
-    target.mkdir(parents=True, exist_ok=True)
-    for name in KEPT:
-        shutil.copyfile(run / name, target / name)
-    if (run / CROSS_TESTS).exists():
-        shutil.copyfile(run / CROSS_TESTS, target / CROSS_TESTS)
-    if (run / "predictor").exists():
-        shutil.copytree(run / "predictor", target / "predictor", dirs_exist_ok=True)
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    for name in (*KEPT, CROSS_TESTS):
+        if (run / name).exists():
+            shutil.copyfile(run / name, target / name)
 
 
 Rows = list[dict[str, str]]
@@ -122,29 +120,28 @@ def main() -> None:
     parser.add_argument("runs", nargs="*", type=Path, help="finished run folders")
     runs = parser.parse_args().runs
     RESULTS.mkdir(exist_ok=True)
-    summary = RESULTS / "summary.csv"
-    rows: dict[tuple[str, ...], dict[str, str]] = {}
-    if summary.exists():
-        with open(summary, newline="") as file:
-            rows = {(r["task"], r["method"], r["seed"]): r for r in csv.DictReader(file)}
     for run in runs:
-        if not (run / "result.json").exists():
+        if (run / "result.json").exists():
+            keep_files(run)
+        else:
             print(f"{run}: not finished, left out")
-            continue
-        row = read_row(run)
-        keep_files(run, row)
-        rows[row["task"], row["method"], row["seed"]] = row
+    ordered = sorted(
+        (read_row(file.parent) for file in RESULTS.glob("*/result.json")),
+        key=lambda row: (row["task"], row["method"], row["seed"]),
+    )
+    summary = RESULTS / "summary.csv"
     with open(summary, "w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(ordered := [rows[key] for key in sorted(rows)])
+        writer.writerows(ordered)
     write_tables(read_results(RESULTS), RESULTS)
     draw_results(RESULTS, RESULTS / "figures")
     for task, name in FEATURED.items():
-        wanted = [key for key in sorted(rows) if key[0] == task and key[1] in FO_AND_HER]
-        draw_curves([RESULTS / "-".join(key) for key in wanted], RESULTS / name)
+        wanted = [row for row in ordered if row["task"] == task and row["method"] in FO_AND_HER]
+        folders = [RESULTS / "-".join((r["task"], r["method"], r["seed"])) for r in wanted]
+        draw_curves(folders, RESULTS / name)
     write_pages(ordered)
-    print(f"{len(rows)} rows in {summary}")
+    print(f"{len(ordered)} rows in {summary}")
 
 
 if __name__ == "__main__":
