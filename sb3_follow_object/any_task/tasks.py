@@ -107,4 +107,7 @@ def effector_of(env_id: str) -> tuple[int, int, int] | None:
     Raises:
         ValueError: the task's object cannot be followed.
     """
-    return (0, 1, 2) if env_id in IDS else derived(env_id).effector
+    if env_id in IDS:
+        return 0, 1, 2
+    found = derived(env_id).effector
+    return None if found is None else found.entries

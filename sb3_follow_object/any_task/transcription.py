@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..envs.physics_engine import mujoco
-from .robot_parts import robot_bodies
+from .robot_parts import carrier, robot_bodies, touching
 
 JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
 _EQUALITIES = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_JOINT)
@@ -65,12 +65,12 @@ def transcribe(
     copied = Transcription(spec)
     _copy_options(model, spec)
     meshes: dict[tuple[str, int], str] = {}
-    touching, robot = _touching(model), robot_bodies(model)
+    touches, robot = touching(model), robot_bodies(model)
     for body in np.flatnonzero(~robot):
         added = _add_body(model, data, int(body), varying, copied)
         first = int(model.body_geomadr[body])
         for geom in range(first, first + int(model.body_geomnum[body])):
-            if touching[geom]:
+            if touches[geom]:
                 _add_geom(model, geom, added, spec, meshes)
     _add_contact_rules(model, copied)
     _add_equalities(model, copied)
@@ -91,14 +91,6 @@ def _copy_options(model: mujoco.MjModel, spec: mujoco.MjSpec) -> None:
     spec.option.disableflags &= ~(int(off.mjDSBL_EQUALITY) | int(off.mjDSBL_CONSTRAINT))
 
 
-def _touching(model: mujoco.MjModel) -> np.ndarray:
-    """Whether each geom can touch anything, bool (ngeom,)."""
-    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    touching[model.pair_geom1] = True
-    touching[model.pair_geom2] = True
-    return touching
-
-
 def _add_body(
     model: mujoco.MjModel,
     data: mujoco.MjData,
@@ -112,7 +104,7 @@ def _add_body(
         copied.bodies[0] = "world"
         return world
     name = copied.bodies[body] = model.body(body).name or f"body:{body}"
-    if model.body_weldid[body] == 0:
+    if carrier(model, body) == 0:
         mocap = body in varying or model.body_mocapid[body] >= 0
         added = world.add_body(
             name=name, pos=data.xpos[body], quat=data.xquat[body], mocap=bool(mocap)

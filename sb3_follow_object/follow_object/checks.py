@@ -110,8 +110,8 @@ def with_effector(reach: Any, env_id: str, imagine: bool) -> Any:
     effector = effector_of(env_id)
     if effector is None:
         raise ValueError(
-            f"{env_id!r}: no part of the robot has its position in the observation; say with "
-            "reach.effector where the effector's is, or reach=null"
+            f"{env_id!r}: no part of the robot has its position in metres in the observation; tell "
+            "it there with effector=, a function of the environment, or say reach=null"
         )
     return {**reach, "effector": effector}
 
