@@ -107,6 +107,9 @@ gym.register("Near-v0", Near, max_episode_steps=50)
 def test_presets_set_a_task_up_as_the_packages_most_similar_one() -> None:
     pushed = run_config("FollowObject/PushSideGap-v0").settings
     settings = run_config(ARM).settings
+    for name in ("n_paths", "object_success", "object_test_every", "object_test_episodes"):
+        assert settings[name] == pushed[name], "what the preset says of all tasks"
+    assert run_config(ARM).eval_every == run_config("FollowObject/PushSideGap-v0").eval_every
     assert settings["algorithm"] == pushed["algorithm"]
     assert settings["object_algorithm"] == pushed["object_algorithm"]
     near = run_config("Near-v0").settings
