@@ -9,7 +9,7 @@ import numpy as np
 
 from ..envs.physics_engine import mujoco
 from .physics_access import physics_of
-from .robot_parts import body_name, carrier, robot_bodies, touching
+from .robot_parts import body_name, carrier, robot_bodies, touching_geoms
 
 N_RESETS, N_STEPS = 20, 30  # watched, the steps after one reset at random
 TOLERANCE = 1e-3  # metres that a body's fixed point may lie off the achieved goal
@@ -204,7 +204,7 @@ def _fingertips(seen: Observed, robot: np.ndarray) -> np.ndarray:
     depth = np.zeros(model.nbody, dtype=int)
     for body in range(1, model.nbody):  # parents come before their children
         depth[body] = depth[model.body_parentid[body]] + int(model.body_jntnum[body] > 0)
-    geoms = np.flatnonzero(touching(model) & robot[model.geom_bodyid])
+    geoms = np.flatnonzero(touching_geoms(model) & robot[model.geom_bodyid])
     if not geoms.size:
         geoms = np.flatnonzero(robot[model.geom_bodyid])
     if not geoms.size:

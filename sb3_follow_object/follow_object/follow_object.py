@@ -29,7 +29,7 @@ from ..object_stage.stage import ObjectStage
 from ..settings.presets import run_config
 from ..settings.run_config import check_plain
 from ..settings.stages import StageSettings
-from .checks import check_algorithms, checked_settings, on_table_for, with_effector
+from .checks import check_algorithms, checked_settings, on_table_for, reach_in
 from .robot_stage import RobotStage
 from .saved_folder import Saved, read, write
 
@@ -143,7 +143,7 @@ class FollowObject:
             "n_threads": n_threads,
             "reward_type": reward_type,
             "algorithm": algorithm or {},
-            **({} if reach is None else {"reach": with_effector(reach, env_id, imagine)}),
+            **({} if reach is None else {"reach": reach_in(reach, env_id, imagine)}),
             "curriculum": curriculum or {},
             "object_algorithm": object_algorithm or {},
             "object_on_table": object_on_table,

@@ -123,6 +123,13 @@ def test_what_stands_elsewhere_in_each_episode_becomes_a_mocap_body() -> None:
     assert alone.geom(top).type == mujoco.mjtGeom.mjGEOM_BOX
 
 
+def test_a_scene_is_copied_without_what_older_mujoco_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(mujoco.MjSpec, "body")  # 3.2.7 has none
+    alone, _ = passive(*kitchen())
+    handle = alone.body("handle").id
+    assert alone.body(alone.body_parentid[handle]).name == "drawer"
+
+
 @pytest.mark.parametrize("of_its_own", [False, True], ids=["before 4.0", "since 4.0"])
 def test_a_mocap_body_stands_in_the_objects_scene_with_any_mujoco(of_its_own: bool) -> None:
     model, data = kitchen()
