@@ -43,7 +43,7 @@ class Effector:
 
     Attributes:
         entries: of the observation.
-        off: mean distance from the middle of the fingertips, metres.
+        off: mean distance from the middle of the robot's fingertips, metres.
     """
 
     entries: tuple[int, int, int]
@@ -199,21 +199,35 @@ def _effector(seen: Observed, entries: tuple[int, int, int], tips: np.ndarray) -
 
 
 def _fingertips(seen: Observed, robot: np.ndarray) -> np.ndarray:
-    """The middle of the geoms at the end of the robot's chain, (n, 3): what touches an object."""
+    """The middle of the ends of what hangs last on the robot, (n, 3): what touches an object."""
     model = seen.model
     depth = np.zeros(model.nbody, dtype=int)
     for body in range(1, model.nbody):  # parents come before their children
         depth[body] = depth[model.body_parentid[body]] + int(model.body_jntnum[body] > 0)
-    geoms = np.flatnonzero(touching_geoms(model) & robot[model.geom_bodyid])
-    if not geoms.size:
-        geoms = np.flatnonzero(robot[model.geom_bodyid])
+    geoms = np.flatnonzero(robot[model.geom_bodyid])
+    touching = geoms[touching_geoms(model)[geoms]]
+    geoms = touching if touching.size else geoms
     if not geoms.size:
         return seen.positions[:, robot & (depth == depth[robot].max())].mean(axis=1)
     of_geoms = depth[model.geom_bodyid[geoms]]
-    geoms = geoms[of_geoms == of_geoms.max()]
-    bodies = model.geom_bodyid[geoms]
-    local = np.einsum("ngij,gj->ngi", seen.rotations[:, bodies], model.geom_pos[geoms])
-    return (seen.positions[:, bodies] + local).mean(axis=1)
+    last = geoms[of_geoms == of_geoms.max()]
+    rest = mujoco.MjData(model)  # all joints where the model was drawn
+    mujoco.mj_kinematics(model, rest)
+    return np.mean([_far_end(seen, rest, int(geom)) for geom in last], axis=0)
+
+
+def _far_end(seen: Observed, rest: mujoco.MjData, geom: int) -> np.ndarray:
+    """The end of a geom's longest side that is farther from the joint before its body's, (n, 3)."""
+    model, body = seen.model, int(seen.model.geom_bodyid[geom])
+    before = carrier(model, int(model.body_parentid[carrier(model, body)]))
+    frame = np.zeros(9)
+    mujoco.mju_quat2Mat(frame, model.geom_quat[geom])
+    centre, half = np.split(model.geom_aabb[geom], 2)
+    long = np.where(np.arange(3) == half.argmax(), half, 0.0)
+    ends = model.geom_pos[geom] + (centre + np.stack([long, -long])) @ frame.reshape(3, 3).T
+    at_rest = rest.xpos[body] + ends @ rest.xmat[body].reshape(3, 3).T
+    far = ends[np.linalg.norm(at_rest - rest.xpos[before], axis=1).argmax()]
+    return seen.positions[:, body] + seen.rotations[:, body] @ far
 
 
 def _passive_roots(model: mujoco.MjModel) -> list[int]:
