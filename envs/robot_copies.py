@@ -86,7 +86,8 @@ def _make(spec: EnvSpec, wrapped: bool, options: dict[str, Any]) -> gym.Env:
     env = gym.make(spec, **options)
     if not wrapped:
         return env
-    return RobotTask(env, object=getattr(env, "followed_object", None))
+    known = env.has_wrapper_attr("followed_object")
+    return RobotTask(env, object=env.get_wrapper_attr("followed_object") if known else None)
 
 
 class ProcessVecEnv(VecEnv):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +14,7 @@ from .goal_envs import SUCCESS_METHODS, missing_goal_keys
 
 Judge = Callable[..., Any]
 GoalOf = Callable[[gym.Env, Any], tuple[Any, Any]]
+EffectorOf = Callable[[gym.Env], Any]
 
 POSITION = 3
 _FAR = 10.0  # metres, farther than any goal is reached from
@@ -34,9 +35,12 @@ class RobotTask(gym.Wrapper):
         is_success: of (achieved, desired) -> whether the goal is reached; None asks the
             environment's method of that name, or else its `compute_reward`.
         object: name of the body that goals are about; None finds it.
+        effector: of (env) -> position of what touches the object, (3,) metres; is told at the end
+            of the observations. None where they tell it already.
 
     Attributes:
         shifted: whether the environment pays 1 on the goal and 0 elsewhere.
+        told_effector: entries of the observation that `effector` has added; None, it adds none.
 
     Raises:
         ValueError: there are no goals; at the first reset, nobody says when one is reached.
@@ -48,11 +52,14 @@ class RobotTask(gym.Wrapper):
         goal: GoalOf | None = None,
         is_success: Judge | None = None,
         object: str | None = None,
+        effector: EffectorOf | None = None,
     ) -> None:
         super().__init__(env)
         self.followed_object = object
         self.shifted = False
+        self.told_effector: tuple[int, int, int] | None = None
         self._goal = goal
+        self._effector = effector
         self._given = is_success
         self._judge: Judge | None = None
         self._batches = False
@@ -64,6 +71,10 @@ class RobotTask(gym.Wrapper):
                 f"{_name(env)} has no goals: its observations lack {', '.join(missing)}; say with "
                 "goal= and is_success= what is achieved, what is desired and when that is reached"
             )
+        if effector is not None:
+            self.observation_space = _with_effector(self.observation_space)
+            n = self.observation_space["observation"].shape[0]
+            self.told_effector = n - 3, n - 2, n - 1
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -84,10 +95,20 @@ class RobotTask(gym.Wrapper):
         return shown, float(success) - 1.0, terminated, truncated, info
 
     def observation(self, obs: Any) -> dict[str, np.ndarray]:
-        """Return an observation of the environment with its goals."""
-        if self._goal is None:
-            return obs
-        goals = self._goal(self.env.unwrapped, obs)
+        """Return an observation of the environment with its goals, and with the effector."""
+        shown = obs if self._goal is None else self._with_goals(obs, self._goal)
+        if self._effector is None:
+            return shown
+        place = np.array(self._effector(self.env.unwrapped), dtype=np.float64)
+        if place.shape != (POSITION,):
+            raise ValueError(
+                f"effector= must return a position of the shape (3,), not {place.shape}"
+            )
+        told = np.concatenate([shown["observation"], place])
+        return {**shown, "observation": told.astype(shown["observation"].dtype)}
+
+    def _with_goals(self, obs: Any, goal: GoalOf) -> dict[str, np.ndarray]:
+        goals = goal(self.env.unwrapped, obs)
         for name, value in zip(("achieved", "desired"), goals, strict=True):
             if np.shape(value) != (POSITION,):
                 raise ValueError(
@@ -207,6 +228,16 @@ def _goal_space(space: spaces.Space) -> spaces.Dict:
     return spaces.Dict(
         {key: spaces.Box(-np.inf, np.inf, (n,), np.float64) for key, n in sizes.items()}
     )
+
+
+def _with_effector(space: spaces.Space) -> spaces.Dict:
+    """The space of observations that end with a position."""
+    keys = dict(cast(spaces.Dict, space).spaces)
+    box = cast(spaces.Box, keys["observation"])
+    anywhere = np.full(POSITION, np.inf)
+    low, high = np.append(box.low, -anywhere), np.append(box.high, anywhere)
+    kind: Any = box.dtype
+    return spaces.Dict({**keys, "observation": spaces.Box(low, high, dtype=kind)})
 
 
 def _parts(obs: Any) -> list[np.ndarray]:

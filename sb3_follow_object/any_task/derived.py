@@ -18,7 +18,7 @@ from ..envs.physics_engine import mujoco
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
 from ..envs.robot_face import POSITION, RobotTask, rewards_on_and_off
-from .finding import Candidate, Observed, candidates, find_effector, find_object, observe
+from .finding import Candidate, Effector, Observed, candidates, find_effector, find_object, observe
 from .physics_access import physics_of
 from .resets import Resets, record_resets, varying_bodies
 from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of
@@ -39,7 +39,7 @@ class Derived:
         env_id: of the robot's task.
         object: the body that goals are about.
         second: how far off the next body is that is not the robot's, metres; None, there is none.
-        effector: where the observation holds a part of the robot; None, nowhere.
+        effector: where the observation holds what touches the object; None, nowhere.
         horizon: T of the robot's episodes.
         success_distance: metres within which a goal is reached in every direction.
         varying: names of what stands elsewhere in each episode.
@@ -52,7 +52,7 @@ class Derived:
     env_id: str
     object: Candidate
     second: float | None
-    effector: tuple[int, int, int] | None
+    effector: Effector | None
     horizon: int
     success_distance: float
     varying: tuple[str, ...]
@@ -148,7 +148,7 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
         env_id,
         found,
         _second(seen, found),
-        find_effector(seen),
+        find_effector(seen, told_effector(env)),
         horizon,
         within,
         tuple(str(model.body(body).name) for body in sorted(varying_bodies(model, resets))),
@@ -216,6 +216,14 @@ def _named_object(env: gym.Env) -> str | None:
         return None
     name: str | None = env.get_wrapper_attr("followed_object")
     return name
+
+
+def told_effector(env: gym.Env) -> tuple[int, int, int] | None:
+    """Entries of the observation that `RobotTask` has added for the effector."""
+    if not env.has_wrapper_attr("told_effector"):
+        return None
+    told: tuple[int, int, int] | None = env.get_wrapper_attr("told_effector")
+    return told
 
 
 def _second(seen: Observed, found: Candidate) -> float | None:

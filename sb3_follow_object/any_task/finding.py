@@ -9,7 +9,7 @@ import numpy as np
 
 from ..envs.physics_engine import mujoco
 from .physics_access import physics_of
-from .robot_parts import body_name, carrier, robot_bodies
+from .robot_parts import body_name, carrier, robot_bodies, touching_geoms
 
 N_RESETS, N_STEPS = 20, 30  # watched, the steps after one reset at random
 TOLERANCE = 1e-3  # metres that a body's fixed point may lie off the achieved goal
@@ -35,6 +35,19 @@ class Candidate:
     offset: np.ndarray
     error: float
     of_robot: bool
+
+
+@dataclass(frozen=True)
+class Effector:
+    """Where the observation holds the position of what touches the object.
+
+    Attributes:
+        entries: of the observation.
+        off: mean distance from the middle of the robot's fingertips, metres.
+    """
+
+    entries: tuple[int, int, int]
+    off: float
 
 
 @dataclass(frozen=True)
@@ -154,22 +167,67 @@ def find_object(seen: Observed, wanted: str | None = None) -> Candidate:
     return free[0]
 
 
-def find_effector(seen: Observed) -> tuple[int, int, int] | None:
-    """Return where the observation holds the position of a part of the robot; None, nowhere.
+def find_effector(seen: Observed, entries: tuple[int, int, int] | None = None) -> Effector | None:
+    """Return where the observation holds the position of what touches the object; None, nowhere.
 
-    Sites are looked at before bodies, for authors mark with them what grips or pushes.
+    Of several parts of the robot it is the one nearest to the fingertips' middle.
+
+    Args:
+        seen: of the environment.
+        entries: where the observation is known to hold it; None looks for it.
     """
     robot = robot_bodies(seen.model)
-    of_sites = robot[seen.model.site_bodyid]
-    for points, of_robot in ((seen.sites, of_sites), (seen.positions, robot)):
-        for first in range(seen.observations.shape[1] - 2):
-            told = seen.observations[:, first : first + 3]
-            if np.ptp(told, axis=0).max() < _LEAST_MOVED:
-                continue
-            distance = np.abs(points - told[:, None]).max(axis=(0, 2))
-            if (of_robot & (distance <= _SAME_PLACE)).any():
-                return first, first + 1, first + 2
-    return None
+    tips = _fingertips(seen, robot)
+    if entries is not None:
+        return _effector(seen, entries, tips)
+    points = np.concatenate([seen.sites, seen.positions], axis=1)
+    points = points[:, np.concatenate([robot[seen.model.site_bodyid], robot])]
+    found: list[Effector] = []
+    for first in range(seen.observations.shape[1] - 2):
+        entries = first, first + 1, first + 2
+        told = seen.observations[:, entries]
+        if np.ptp(told, axis=0).max() < _LEAST_MOVED:
+            continue
+        if (np.abs(points - told[:, None]).max(axis=(0, 2), initial=0.0) <= _SAME_PLACE).any():
+            found.append(_effector(seen, entries, tips))
+    return min(found, key=lambda each: round(each.off, 3), default=None)
+
+
+def _effector(seen: Observed, entries: tuple[int, int, int], tips: np.ndarray) -> Effector:
+    told = seen.observations[:, entries]
+    return Effector(entries, float(np.linalg.norm(told - tips, axis=1).mean()))
+
+
+def _fingertips(seen: Observed, robot: np.ndarray) -> np.ndarray:
+    """The middle of the ends of what hangs last on the robot, (n, 3): what touches an object."""
+    model = seen.model
+    depth = np.zeros(model.nbody, dtype=int)
+    for body in range(1, model.nbody):  # parents come before their children
+        depth[body] = depth[model.body_parentid[body]] + int(model.body_jntnum[body] > 0)
+    geoms = np.flatnonzero(robot[model.geom_bodyid])
+    touching = geoms[touching_geoms(model)[geoms]]
+    geoms = touching if touching.size else geoms
+    if not geoms.size:
+        return seen.positions[:, robot & (depth == depth[robot].max())].mean(axis=1)
+    of_geoms = depth[model.geom_bodyid[geoms]]
+    last = geoms[of_geoms == of_geoms.max()]
+    rest = mujoco.MjData(model)  # all joints where the model was drawn
+    mujoco.mj_kinematics(model, rest)
+    return np.mean([_far_end(seen, rest, int(geom)) for geom in last], axis=0)
+
+
+def _far_end(seen: Observed, rest: mujoco.MjData, geom: int) -> np.ndarray:
+    """The end of a geom's longest side that is farther from the joint before its body's, (n, 3)."""
+    model, body = seen.model, int(seen.model.geom_bodyid[geom])
+    before = carrier(model, int(model.body_parentid[carrier(model, body)]))
+    frame = np.zeros(9)
+    mujoco.mju_quat2Mat(frame, model.geom_quat[geom])
+    centre, half = np.split(model.geom_aabb[geom], 2)
+    long = np.where(np.arange(3) == half.argmax(), half, 0.0)
+    ends = model.geom_pos[geom] + (centre + np.stack([long, -long])) @ frame.reshape(3, 3).T
+    at_rest = rest.xpos[body] + ends @ rest.xmat[body].reshape(3, 3).T
+    far = ends[np.linalg.norm(at_rest - rest.xpos[before], axis=1).argmax()]
+    return seen.positions[:, body] + seen.rotations[:, body] @ far
 
 
 def _passive_roots(model: mujoco.MjModel) -> list[int]:

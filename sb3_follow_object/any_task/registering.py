@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 
 from ..envs.registration import import_task
-from ..envs.robot_face import GoalOf, Judge, RobotTask
+from ..envs.robot_face import EffectorOf, GoalOf, Judge, RobotTask
 
 MakeEnv = Callable[[], gym.Env]
 NAMESPACE = "Followed"
@@ -23,6 +23,7 @@ def registered(
     object: str | None = None,
     goal: GoalOf | None = None,
     is_success: Judge | None = None,
+    effector: EffectorOf | None = None,
 ) -> str:
     """Return the id of an environment, registered with gymnasium where it has none of this kind.
 
@@ -32,6 +33,7 @@ def registered(
         object: name of the body that goals are about; None finds it.
         goal: of (env, observation) -> achieved and desired goal; None where observations hold them.
         is_success: of (achieved, desired) -> whether a goal is reached; None asks the environment.
+        effector: of (env) -> position of what touches the object; None where observations hold it.
 
     Returns:
         `env_id` where nothing else is given.
@@ -42,7 +44,7 @@ def registered(
     """
     if (env_id is None) == (make_env is None):
         raise ValueError("give an environment's id, or make_env, a function that makes it")
-    extras = (object, goal, is_success)
+    extras = (object, goal, is_success, effector)
     if make_env is None and all(extra is None for extra in extras):
         assert env_id is not None
         return env_id
@@ -85,13 +87,14 @@ def _make(
     object: str | None,
     goal: GoalOf | None,
     is_success: Judge | None,
+    effector: EffectorOf | None,
     render_mode: str | None = None,
     **options: Any,
 ) -> gym.Env:
     if render_mode is not None and isinstance(make_env, partial):  # gymnasium's own make
         options = {**options, "render_mode": render_mode}
     env = make_env(**options)
-    if goal is None and is_success is None:
+    if goal is None and is_success is None and effector is None:
         env.followed_object = object  # type: ignore[attr-defined]
         return env
-    return RobotTask(env, goal, is_success, object)
+    return RobotTask(env, goal, is_success, object, effector)

@@ -13,7 +13,7 @@ import numpy as np
 from ..common.array_trees import load_tree, save_tree
 from ..envs.physics_engine import mujoco
 from .physics_access import physics_of
-from .robot_parts import robot_bodies
+from .robot_parts import robot_bodies, standing
 
 SURFACE_SHARE, SURFACE_HEIGHT = 0.99, 0.012  # share of the goals, metres off the start's height
 _SAME = 1e-6  # metres, and parts of a unit quaternion
@@ -90,7 +90,7 @@ def record_resets(
             )
         )
         if first is None:
-            first = _copies(model, data)
+            first = copy.copy(model), copy.copy(data)
         begun(seed + 1)
     assert first is not None
     return Resets(*(np.stack(column) for column in zip(*rows, strict=True))), *first
@@ -99,12 +99,5 @@ def record_resets(
 def varying_bodies(model: mujoco.MjModel, resets: Resets) -> frozenset[int]:
     """Bodies that stand still within an episode and elsewhere in another, the robot's left out."""
     spread = np.ptp(resets.places, axis=0).max(axis=1)
-    stands = (model.body_weldid == 0) & ~robot_bodies(model)
+    stands = standing(model) & ~robot_bodies(model)
     return frozenset(int(body) for body in np.flatnonzero(stands & (spread > _SAME)) if body)
-
-
-def _copies(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    model = copy.copy(model)
-    twin = mujoco.MjData(model)
-    mujoco.mj_copyData(twin, model, data)
-    return model, twin

@@ -1,4 +1,4 @@
-"""Which bodies of a compiled model are the robot's, and which move with each other."""
+"""Which bodies of a compiled model are the robot's, which move with each other, which touch."""
 
 from __future__ import annotations
 
@@ -38,8 +38,17 @@ def first_jointed(model: mujoco.MjModel, body: int) -> int:
 
 
 def carrier(model: mujoco.MjModel, body: int) -> int:
-    """The body with the joints that this one is rigidly fixed to, maybe itself; 0, the world."""
-    return int(model.body_weldid[body])
+    """The body with the joints that this one is rigidly fixed to, maybe itself; 0, none has any."""
+    root = int(model.body_weldid[body])
+    return root if model.body_jntnum[root] else 0
+
+
+def standing(model: mujoco.MjModel) -> np.ndarray:
+    """Whether each body has no joint above it, bool (nbody,).
+
+    What a mocap body carries is fixed to the world before MuJoCo 4.0, and to the mocap body since.
+    """
+    return model.body_jntnum[model.body_weldid] == 0
 
 
 def rigid_group(model: mujoco.MjModel, body: int) -> np.ndarray:
@@ -50,6 +59,14 @@ def rigid_group(model: mujoco.MjModel, body: int) -> np.ndarray:
 def body_name(model: mujoco.MjModel, body: int) -> str:
     """A body's name, or "body 7" where it has none."""
     return str(model.body(body).name) or f"body {body}"
+
+
+def touching_geoms(model: mujoco.MjModel) -> np.ndarray:
+    """Whether each geom can touch anything, bool (ngeom,)."""
+    touching: np.ndarray = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    touching[model.pair_geom1] = True
+    touching[model.pair_geom2] = True
+    return touching
 
 
 def _driven(model: mujoco.MjModel) -> set[int]:

@@ -98,7 +98,7 @@ def object_scene_of(
     copied = transcribe(model, data, varying_bodies(model, resets))
     heavy = _heaviest(model, body)
     spec = copied.spec
-    spec.body(copied.bodies[body]).add_site(name=POINT, pos=offset)
+    copied.added[body].add_site(name=POINT, pos=offset)
     spec.worldbody.add_body(name=PULLER, mocap=True)
     weld_to(spec, PULLER, copied.bodies[heavy])
     alone = spec.compile()

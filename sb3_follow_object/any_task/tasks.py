@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..common.reports import Report
 from ..envs import IDS, make_vec, object_id, physics_id
+from ..envs.goal_envs import missing_goal_keys
+from ..envs.registration import import_task
+from ..envs.robot_copies import robot_maker
 from ..envs.tasks import SUCCESS_DISTANCE
-from .derived import derived, object_horizon
+from .derived import derived, object_horizon, told_effector
+from .finding import find_effector, observe
 from .simulation import DerivedObjectVecEnv
 
 SURFACE_STEPS = 120_000  # env steps after which an object left on its surface may leave it
+_LEAST_TO_REACH = 25  # env steps
 
 
 def check_followable(env_id: str, report: Report = lambda sentence: None) -> None:
@@ -107,4 +113,31 @@ def effector_of(env_id: str) -> tuple[int, int, int] | None:
     Raises:
         ValueError: the task's object cannot be followed.
     """
-    return (0, 1, 2) if env_id in IDS else derived(env_id).effector
+    if env_id in IDS:
+        return 0, 1, 2
+    found = derived(env_id).effector
+    return None if found is None else found.entries
+
+
+def effector_seen_in(env_id: str) -> tuple[int, int, int] | None:
+    """As `effector_of`, of a task of others whose object need not be followed; None, not found."""
+    env = robot_maker(env_id)()
+    try:
+        if missing_goal_keys(env.observation_space):
+            return None
+        found = find_effector(observe(env), told_effector(env))
+    except ValueError:  # no MuJoCo
+        return None
+    finally:
+        env.close()
+    return None if found is None else found.entries
+
+
+def steps_to_reach(env_id: str) -> int:
+    """Env steps that an effector may take to the object in a task of others, half an episode's.
+
+    The package's own have 25 of some 50: robots that need longer episodes are slower.
+    """
+    spec = gym.registry.get(import_task(env_id))
+    horizon = 0 if spec is None else spec.max_episode_steps or 0
+    return max(_LEAST_TO_REACH, horizon // 2)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..envs.physics_engine import mujoco
-from .robot_parts import robot_bodies
+from .robot_parts import carrier, robot_bodies, touching_geoms
 
 JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
 _EQUALITIES = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_JOINT)
@@ -25,12 +25,14 @@ class Transcription:
     Attributes:
         spec: not compiled yet; may be added to.
         bodies: body of the model -> name in the spec.
+        added: body of the model -> body of the spec; older MuJoCo finds none by its name.
         joints: joint of the model -> name in the spec.
         standing: bodies that nothing moves within an episode and that are mocap bodies here.
     """
 
     spec: mujoco.MjSpec
     bodies: dict[int, str] = field(default_factory=dict)
+    added: dict[int, Any] = field(default_factory=dict)
     joints: dict[int, str] = field(default_factory=dict)
     standing: list[int] = field(default_factory=list)
 
@@ -65,7 +67,7 @@ def transcribe(
     copied = Transcription(spec)
     _copy_options(model, spec)
     meshes: dict[tuple[str, int], str] = {}
-    touching, robot = _touching(model), robot_bodies(model)
+    touching, robot = touching_geoms(model), robot_bodies(model)
     for body in np.flatnonzero(~robot):
         added = _add_body(model, data, int(body), varying, copied)
         first = int(model.body_geomadr[body])
@@ -91,14 +93,6 @@ def _copy_options(model: mujoco.MjModel, spec: mujoco.MjSpec) -> None:
     spec.option.disableflags &= ~(int(off.mjDSBL_EQUALITY) | int(off.mjDSBL_CONSTRAINT))
 
 
-def _touching(model: mujoco.MjModel) -> np.ndarray:
-    """Whether each geom can touch anything, bool (ngeom,)."""
-    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    touching[model.pair_geom1] = True
-    touching[model.pair_geom2] = True
-    return touching
-
-
 def _add_body(
     model: mujoco.MjModel,
     data: mujoco.MjData,
@@ -109,19 +103,21 @@ def _add_body(
     """Add a body with its inertia and joints; what stands still goes below the world."""
     world = copied.spec.worldbody
     if body == 0:
-        copied.bodies[0] = "world"
+        copied.bodies[0], copied.added[0] = "world", world
         return world
     name = copied.bodies[body] = model.body(body).name or f"body:{body}"
-    if model.body_weldid[body] == 0:
+    if carrier(model, body) == 0:
         mocap = body in varying or model.body_mocapid[body] >= 0
         added = world.add_body(
             name=name, pos=data.xpos[body], quat=data.xquat[body], mocap=bool(mocap)
         )
+        copied.added[body] = added
         if mocap:
             copied.standing.append(body)
         return added
-    parent = copied.spec.body(copied.bodies[int(model.body_parentid[body])])
+    parent = copied.added[int(model.body_parentid[body])]
     added = parent.add_body(name=name, pos=model.body_pos[body], quat=model.body_quat[body])
+    copied.added[body] = added
     added.explicitinertial = True
     added.mass = float(model.body_mass[body])
     added.ipos[:], added.iquat[:] = model.body_ipos[body], model.body_iquat[body]

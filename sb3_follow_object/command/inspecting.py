@@ -93,7 +93,9 @@ def _shifted(found: Derived) -> str:
 def _effector(found: Derived) -> str:
     if found.effector is None:
         return "not told in the observation"
-    return f"observation[{found.effector[0]}:{found.effector[-1] + 1}]"
+    first, _, last = found.effector.entries
+    off = found.effector.off * 1e3
+    return f"observation[{first}:{last + 1}], {off:.0f} mm off the fingertips' middle"
 
 
 def _object_speed(found: Derived) -> float:

@@ -9,7 +9,13 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..any_task.tasks import effector_of, object_vec_env, steps_of_object
+from ..any_task.tasks import (
+    effector_of,
+    effector_seen_in,
+    object_vec_env,
+    steps_of_object,
+    steps_to_reach,
+)
 from ..common.numbers import checked_whole
 from ..common.torch_helpers import usable_device
 from ..ddpg.her_ddpg import HerDDPG
@@ -94,26 +100,30 @@ def reach_parts(
     return first, teaching
 
 
-def with_effector(reach: Any, env_id: str, imagine: bool) -> Any:
-    """Return the setting `reach` with the effector's place in the observation, where it is found.
+def reach_in(reach: Any, env_id: str, imagine: bool) -> Any:
+    """Return the setting `reach` with what a task of others says of it: effector and steps.
 
     Args:
         reach: as given.
-        env_id: a task; of others' with imagined goals the physics says where the effector is told.
+        env_id: a task; the physics of one of others says where the observation tells the effector.
         imagine: whether goals are imagined.
 
     Raises:
-        ValueError: no part of the robot is told in the observation.
+        ValueError: goals are imagined, and no part of the robot is told in the observation.
     """
-    if not isinstance(reach, Mapping) or "effector" in reach or env_id in IDS or not imagine:
+    if not isinstance(reach, Mapping) or env_id in IDS:
         return reach
-    effector = effector_of(env_id)
-    if effector is None:
-        raise ValueError(
-            f"{env_id!r}: no part of the robot has its position in the observation; say with "
-            "reach.effector where the effector's is, or reach=null"
-        )
-    return {**reach, "effector": effector}
+    found: dict[str, Any] = {"max_steps": steps_to_reach(env_id)}
+    if "effector" not in reach:
+        effector = effector_of(env_id) if imagine else effector_seen_in(env_id)
+        if effector is not None:
+            found["effector"] = effector
+        elif imagine:
+            raise ValueError(
+                f"{env_id!r}: no part of the robot has its position in metres in the observation; "
+                "tell it there with effector=, a function of the environment, or say reach=null"
+            )
+    return {**found, **reach}
 
 
 def on_table_for(lift: object, on_table: bool | None) -> bool:

@@ -19,7 +19,7 @@ from ..common.reports import Report
 from ..ddpg.actor_files import save_actor
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs.goal_envs import known_id
-from ..envs.robot_face import GoalOf, Judge
+from ..envs.robot_face import EffectorOf, GoalOf, Judge
 from ..imagination.curriculum import Curriculum
 from ..imagination.goal_predictor import GoalPredictor
 from ..object_stage.networks import FILE as OBJECT_FILE
@@ -29,7 +29,7 @@ from ..object_stage.stage import ObjectStage
 from ..settings.presets import run_config
 from ..settings.run_config import check_plain
 from ..settings.stages import StageSettings
-from .checks import check_algorithms, checked_settings, on_table_for, with_effector
+from .checks import check_algorithms, checked_settings, on_table_for, reach_in
 from .robot_stage import RobotStage
 from .saved_folder import Saved, read, write
 
@@ -49,6 +49,8 @@ class FollowObject:
         goal: for environments without goals, a function of (env, observation) that returns the
             achieved and the desired position, (3,) metres each.
         is_success: likewise of (achieved, desired): whether the goal is reached.
+        effector: likewise of (env): position of what touches the object, (3,) metres, where the
+            observation does not hold it; is told at the observation's end.
         lift: whether the object may leave its surface in the first stage; "auto" decides by the
             heights of the goals, and by whether the object learns. The opposite of
             `object_on_table`.
@@ -97,6 +99,7 @@ class FollowObject:
         object: str | None = None,
         goal: GoalOf | None = None,
         is_success: Judge | None = None,
+        effector: EffectorOf | None = None,
         lift: bool | Literal["auto"] = "auto",
         imagine: bool = True,
         predictor: GoalPredictor | None = None,
@@ -124,7 +127,12 @@ class FollowObject:
         report: Report | None = None,
     ):
         full_id = registered(
-            env_id, make_env=make_env, object=object, goal=goal, is_success=is_success
+            env_id,
+            make_env=make_env,
+            object=object,
+            goal=goal,
+            is_success=is_success,
+            effector=effector,
         )
         env_id = known_id(full_id)
         if lift != "auto":
@@ -135,7 +143,7 @@ class FollowObject:
             "n_threads": n_threads,
             "reward_type": reward_type,
             "algorithm": algorithm or {},
-            **({} if reach is None else {"reach": with_effector(reach, env_id, imagine)}),
+            **({} if reach is None else {"reach": reach_in(reach, env_id, imagine)}),
             "curriculum": curriculum or {},
             "object_algorithm": object_algorithm or {},
             "object_on_table": object_on_table,
@@ -195,12 +203,12 @@ class FollowObject:
             overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win. Those
                 of a run folder (n_timesteps, eval_every and the like) mean nothing here.
             **arguments: of the class, which are no settings: predictor, object_networks, report,
-                make_env, object, goal, is_success, lift.
+                make_env, object, goal, is_success, effector, lift.
 
         Raises:
             ValueError: an id, a key or a value that cannot be meant, with the nearest that can.
         """
-        own = ("make_env", "object", "goal", "is_success")
+        own = ("make_env", "object", "goal", "is_success", "effector")
         given = {name: arguments.pop(name) for name in own if name in arguments}
         env_id = registered(env_id, **given)
         config = run_config(env_id, method=method, preset=preset, seed=seed, overrides=overrides)
@@ -356,8 +364,8 @@ class FollowObject:
         Args:
             folder: that `save` was given.
             report: as of the class.
-            **environment: env_id, make_env, object, goal and is_success as they were given, where
-                an id alone did not say it.
+            **environment: env_id, make_env, object, goal, is_success and effector as they were
+                given, where an id alone did not say it.
 
         Raises:
             ValueError: the folder holds no save, or one that is damaged.

@@ -99,7 +99,8 @@ def run_config(
     entries = read_yaml(path)
     entry = _entry(entries, env_id, path)
     imagine = WRAPPER in _named(entry, "env_wrapper", path)
-    settings = _of_runs(entries, path) | _flattened(entry, path)
+    of_runs = _of_runs(entries, path)
+    settings = of_runs | _flattened(entry, path)
     has_object_stage = imagine or _auxiliary_name(settings) == "sldr"
     if has_object_stage and env_id not in IDS:
         if _auxiliary_name(settings) == "sldr":
@@ -110,7 +111,7 @@ def run_config(
         check_followable(env_id)
         if env_id not in entries:  # set up as the package's most similar task
             if surface_choices(env_id)[0]:
-                settings = _flattened(_entry(entries, SIMILAR[True], path), path)
+                settings = of_runs | _flattened(_entry(entries, SIMILAR[True], path), path)
             _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
     of_object = object_id(env_id if env_id in IDS else SIMILAR[False])
     if has_object_stage and _find(entries, of_object) is not None:

@@ -10,7 +10,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from scenes import kitchen
+from scenes import fingers, kitchen
 
 from sb3_follow_object.any_task.finding import Observed, find_effector, find_object, observe
 from sb3_follow_object.envs.registration import import_task
@@ -50,6 +50,11 @@ class Kitchen(gym.Env):
         return {"observation": tip, "achieved_goal": achieved, "desired_goal": np.zeros(3)}
 
 
+def _entries(seen: Observed) -> tuple[int, int, int] | None:
+    found = find_effector(seen)
+    return None if found is None else found.entries
+
+
 @pytest.fixture(scope="module")
 def arm() -> Iterator[Observed]:
     env = gym.make(arm_and_wall.ARM)
@@ -61,7 +66,9 @@ def test_the_tutorials_box_is_found(arm: Observed) -> None:
     found = find_object(arm)
     assert (found.name, found.of_robot) == ("box", False)
     assert found.error < 1e-6 and np.abs(found.offset).max() < 1e-6
-    assert find_effector(arm) == (0, 1, 2)
+    effector = find_effector(arm)
+    assert effector is not None and effector.entries == (0, 1, 2)
+    assert effector.off < 0.003, "the stick's lower end, though it is lifted"
 
 
 def test_a_point_off_a_body_is_mapped_to_the_body_with_the_joint() -> None:
@@ -79,7 +86,43 @@ def test_a_drawers_handle_is_followed_like_an_object() -> None:
 
 
 def test_the_effector_is_a_point_of_the_robot_in_the_observation() -> None:
-    assert find_effector(observe(Kitchen())) == (0, 1, 2)
+    assert _entries(observe(Kitchen())) == (0, 1, 2)
+
+
+class Grip(Kitchen):
+    """A hand over a box that tells its own place, the box's, and where its fingers meet."""
+
+    def __init__(self, scale: float = 1.0) -> None:
+        super().__init__("box")
+        self.model, self.data = fingers()
+        self.scale = scale
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (4,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:2] = self.np_random.uniform(-0.1, 0.1, 2)
+        self.data.joint(4).qpos[:2] = self.np_random.uniform(-0.1, 0.1, 2)
+        mujoco.mj_forward(self.model, self.data)
+        return self._observation(), {}
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        box, hand = self.data.body("box").xpos.copy(), self.data.body("hand").xpos
+        told = self.scale * np.concatenate([hand, box, self.data.site("grip").xpos])
+        return {"observation": told, "achieved_goal": box, "desired_goal": np.zeros(3)}
+
+
+def test_of_several_points_of_the_robot_the_one_between_its_fingertips_is_the_effector() -> None:
+    seen = observe(Grip())
+    found = find_effector(seen)
+    assert found is not None and found.entries == (6, 7, 8)
+    assert found.off < 0.03, "the fingers move apart, and end 10 mm below"
+    hand = find_effector(seen, (0, 1, 2))  # as an environment may say
+    assert hand is not None and hand.off == pytest.approx(0.07, abs=0.01)
+
+
+def test_an_observation_that_is_scaled_holds_no_effector() -> None:
+    assert find_effector(observe(Grip(scale=10.0))) is None
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,42 @@ def test_goals_of_an_id_are_what_the_functions_say() -> None:
     env.close()
 
 
+class ZeroOne(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
+    """Pays 1 on the goal."""
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, *rest = super().step(action)
+        return obs, reward + 1.0, *rest
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        return super().compute_reward(achieved, desired, info) + 1.0
+
+
+def test_an_objects_name_is_kept_where_rewards_are_shown_otherwise() -> None:
+    env_id = registered(make_env=lambda: TimeLimit(ZeroOne(), 30), object="box")
+    env = robot_maker(env_id)()
+    env.reset(seed=0)
+    assert env.get_wrapper_attr("shifted")
+    assert env.get_wrapper_attr("followed_object") == "box"
+    env.close()
+
+
+def test_an_effector_is_told_at_the_observations_end() -> None:
+    def elbow(env: Any) -> np.ndarray:
+        return env.data.body("forearm").xpos
+
+    env_id = registered(arm_and_wall.ARM, effector=elbow)
+    env = robot_maker(env_id)()
+    told = env.get_wrapper_attr("told_effector")
+    assert told == (21, 22, 23)
+    obs, _ = env.reset(seed=0)
+    for action in (np.ones(3), -np.ones(3)):
+        assert env.observation_space.contains(obs)
+        np.testing.assert_allclose(obs["observation"][list(told)], elbow(env.unwrapped), atol=1e-7)
+        obs = env.step(action)[0]
+    env.close()
+
+
 def test_an_id_alone_stays_what_it_is() -> None:
     assert registered("FetchPush-v4") == "FetchPush-v4"
 

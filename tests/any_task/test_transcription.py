@@ -10,7 +10,7 @@ import pytest
 from scenes import kitchen, throw
 
 from sb3_follow_object.any_task.physics_access import physics_of
-from sb3_follow_object.any_task.robot_parts import body_name, robot_bodies
+from sb3_follow_object.any_task.robot_parts import body_name, carrier, robot_bodies, standing
 from sb3_follow_object.any_task.scene import PULLER
 from sb3_follow_object.any_task.transcription import transcribe
 from sb3_follow_object.envs.registration import import_task
@@ -121,6 +121,23 @@ def test_what_stands_elsewhere_in_each_episode_becomes_a_mocap_body() -> None:
     mug = int(alone.body("mug").geomadr[0])
     assert (int(alone.body("shelf").geomadr[0]), mug) in touched
     assert alone.geom(top).type == mujoco.mjtGeom.mjGEOM_BOX
+
+
+def test_a_scene_is_copied_without_what_older_mujoco_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(mujoco.MjSpec, "body")  # 3.2.7 has none
+    alone, _ = passive(*kitchen())
+    handle = alone.body("handle").id
+    assert alone.body(alone.body_parentid[handle]).name == "drawer"
+
+
+@pytest.mark.parametrize("of_its_own", [False, True], ids=["before 4.0", "since 4.0"])
+def test_a_mocap_body_stands_in_the_objects_scene_with_any_mujoco(of_its_own: bool) -> None:
+    model, data = kitchen()
+    puller = model.body("puller").id
+    model.body_weldid[puller] = puller if of_its_own else 0
+    assert standing(model)[puller] and carrier(model, puller) == 0
+    alone, _ = passive(model, data)
+    assert alone.body("puller").mocapid[0] >= 0
 
 
 def test_a_weld_pulls_the_part_that_has_the_mass() -> None:

@@ -39,11 +39,22 @@ np.savez(sys.argv[1], **kept)
 print(mujoco.__version__)
 """
 FOREIGN = """
+import numpy as np
+
+from sb3_follow_object.any_task import derived as looking
+from sb3_follow_object.any_task.simulation import DerivedObjectVecEnv
 from sb3_follow_object.envs import make_vec
 
 try:
     env = make_vec("FetchPush-v4", 1)
     env.reset()
+    looking.N_RESETS = 20
+    found = looking.derived("FetchPush-v4")
+    alone = DerivedObjectVecEnv(found.scene, 2, 1, seed=0, on_table=True)
+    start = alone.reset()["achieved_goal"].copy()
+    for _ in range(5):
+        obs = alone.step(np.tile([0.5, 0, 0, 0, 0, 0, 0], (2, 1)))[0]
+    assert (obs["achieved_goal"] - start)[:, 0].min() > 0.02, "it is pulled"
     print("runs")
 except ValueError as error:
     print(error)

@@ -132,6 +132,10 @@ def test_two_functions_make_a_goal_environment() -> None:
             lambda: RobotTask(Vector(), lambda env, obs: (obs[:2], env.goal)),
             r"two positions of the shape \(3,\); the achieved one has the shape \(2,\)",
         ),
+        (
+            lambda: RobotTask(toy.PointEnv(), effector=lambda env: env.position[:2]),
+            r"effector= must return a position of the shape \(3,\), not \(2,\)",
+        ),
     ],
 )
 def test_what_tells_too_little_is_refused(make: Any, sentence: str) -> None:

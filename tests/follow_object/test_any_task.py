@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.wrappers import TimeLimit
 from small_models import weights
 from stable_baselines3.common.callbacks import BaseCallback
 from tiny_runs import TINY, quiet
@@ -43,6 +44,46 @@ def test_a_save_goes_on_as_the_whole_does(tmp_path: Path) -> None:
     assert whole.model is not None and resumed.model is not None
     assert resumed.env_steps == whole.env_steps > part.env_steps
     th.testing.assert_close(weights(resumed.model), weights(whole.model), rtol=0, atol=0)
+
+
+def test_reaching_takes_what_a_task_of_others_says_of_it() -> None:
+    def elbow(env: Any) -> np.ndarray:
+        return env.data.body("forearm").xpos
+
+    def long() -> gym.Env:
+        return TimeLimit(arm_and_wall.ArmAndWall(), 120)  # type: ignore[attr-defined]
+
+    for imagine in (True, False):
+        settings = {**TINY, "imagine": imagine, "reach": {}}
+        known = FollowObject(ARM, **settings).settings["reach"]
+        assert (known["effector"], known["max_steps"]) == ((0, 1, 2), 25)
+        slow = FollowObject(make_env=long, effector=elbow, **settings).settings["reach"]
+        assert (slow["effector"], slow["max_steps"]) == ((21, 22, 23), 60)
+    given = FollowObject(
+        make_env=long, **{**TINY, "reach": {"max_steps": 7, "effector": [3, 4, 5]}}
+    )
+    assert given.settings["reach"]["max_steps"] == 7
+    assert tuple(given.settings["reach"]["effector"]) == (3, 4, 5)
+
+
+class Scaled(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
+    """Tells everything in decimetres."""
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        told = super()._observation()
+        return {**told, "observation": 10.0 * told["observation"]}
+
+
+def test_a_robot_whose_place_is_not_told_cannot_reach_and_may_be_told() -> None:
+    def scaled() -> gym.Env:
+        return TimeLimit(Scaled(), 50)
+
+    with pytest.raises(ValueError, match="no part of the robot has its position in metres"):
+        FollowObject(make_env=scaled, **TINY, reach={})
+    told = FollowObject(
+        make_env=scaled, effector=lambda env: env.data.site("tip").xpos, **TINY, reach={}
+    )
+    assert told.settings["reach"]["effector"] == (21, 22, 23)
 
 
 def test_an_object_that_does_not_learn_on_its_surface_may_leave_it(
@@ -107,6 +148,9 @@ gym.register("Near-v0", Near, max_episode_steps=50)
 def test_presets_set_a_task_up_as_the_packages_most_similar_one() -> None:
     pushed = run_config("FollowObject/PushSideGap-v0").settings
     settings = run_config(ARM).settings
+    for name in ("n_paths", "object_success", "object_test_every", "object_test_episodes"):
+        assert settings[name] == pushed[name], "what the preset says of all tasks"
+    assert run_config(ARM).eval_every == run_config("FollowObject/PushSideGap-v0").eval_every
     assert settings["algorithm"] == pushed["algorithm"]
     assert settings["object_algorithm"] == pushed["object_algorithm"]
     near = run_config("Near-v0").settings

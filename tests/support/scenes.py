@@ -49,10 +49,47 @@ KITCHEN = """
 </mujoco>
 """
 
+# A hand with two fingers below it over a box on a table; where the fingers meet there is a site.
+FINGERS = """
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom type="plane" size="2 2 .1"/>
+    <body name="hand" pos="0 0 0.2">
+      <joint name="x" type="slide" axis="1 0 0" damping="5"/>
+      <joint name="z" type="slide" axis="0 0 1" damping="5"/>
+      <geom type="sphere" size="0.02" mass="0.1" contype="0" conaffinity="0"/>
+      <site name="grip" pos="0 0 -0.06"/>
+      <body name="left" pos="0 0.02 -0.06">
+        <joint name="l" type="slide" axis="0 1 0" range="0 0.02" damping="5"/>
+        <geom type="box" size="0.01 0.004 0.01" mass="0.02"/>
+      </body>
+      <body name="right" pos="0 -0.02 -0.06">
+        <joint name="r" type="slide" axis="0 -1 0" range="0 0.02" damping="5"/>
+        <geom type="box" size="0.01 0.004 0.01" mass="0.02"/>
+      </body>
+    </body>
+    <body name="box" pos="0.1 0 0.02"><freejoint/><geom type="box" size=".02 .02 .02"/></body>
+  </worldbody>
+  <actuator>
+    <position joint="x" kp="50"/><position joint="z" kp="50"/>
+    <position joint="l" kp="50"/><position joint="r" kp="50"/>
+  </actuator>
+</mujoco>
+"""
+
 
 def kitchen() -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The scene, its kinematics run."""
     model = mujoco.MjModel.from_xml_string(KITCHEN)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def fingers() -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The hand over the box, its kinematics run."""
+    model = mujoco.MjModel.from_xml_string(FINGERS)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     return model, data
