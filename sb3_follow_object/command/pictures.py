@@ -170,7 +170,7 @@ def play(
     n_episodes: int,
     seed: int,
     each_step: EachStep,
-    each_episode: EachEpisode,
+    each_episode: EachEpisode = lambda episode, success: None,
 ) -> float:
     """Play noise-free episodes and return their success rate.
 

@@ -50,6 +50,24 @@ def test_story_shows_object_goals_and_robot(tmp_path: Path) -> None:
         assert (np.abs(parts[0] - parts[1]).max(axis=-1) > 60).sum() > 50
 
 
+def test_story_of_a_robot_that_never_succeeds_is_refused_before_anything_is_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds = []
+
+    def miss(actor: object, env: object, n_episodes: int, seed: int, each_step: object) -> float:
+        seeds.append(seed)
+        return 0.0
+
+    monkeypatch.setattr(films, "play", miss)
+    monkeypatch.setattr(films, "frame", lambda env: pytest.fail("it was drawn"))
+    policy, out = demo.demo_policy("PnPShelf"), tmp_path / "story.gif"
+    with pytest.raises(RuntimeError, match="does not succeed in 20 episodes"):
+        films.draw_story(policy, toy.StraightPredictor(), TASK, out, seed=100)
+    assert seeds == list(range(100, 120))
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.usefixtures("can_draw")
 def test_film_is_in_the_log_at_the_runs_last_step(tmp_path: Path) -> None:
     (tmp_path / "policy.safetensors").write_bytes(demo.demo_policy("PnPShelf").read_bytes())
