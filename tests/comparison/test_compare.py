@@ -18,6 +18,7 @@ from result_folders import finish
 
 from sb3_follow_object.command import cli
 from sb3_follow_object.common.files import lock
+from sb3_follow_object.comparison import figures
 from sb3_follow_object.comparison.cells import Cell, Settings, prepare
 from sb3_follow_object.comparison.compare import Comparison, share_cores
 from sb3_follow_object.comparison.cross import CROSS_TESTS
@@ -324,12 +325,15 @@ def test_real_run_is_stopped_resumed_and_ends(
 
     monkeypatch.setattr(GridDisplay, "update", stop_at_once)
     run = tmp_path / "PushSideGap-her-5"
-    assert cli.main(words) == 130
+    with monkeypatch.context() as patch:
+        patch.setattr(figures, "draw_results", lambda *arguments: [])
+        assert cli.main(words) == 130
     assert "the same command goes on" in capsys.readouterr().err
     assert not (run / RESULT).exists()
     assert list(run.glob("checkpoint*")), "it was stopped without a checkpoint"
     assert "unfinished" in (tmp_path / "table.md").read_text()
     assert cli.main(words) == 0
+    assert list((tmp_path / "figures").glob("*.png"))
     printed = capsys.readouterr()
     assert "resumed at" in (tmp_path / "logs" / "PushSideGap-her-5.log").read_text()
     assert "| PushSideGap | " in printed.out
