@@ -79,7 +79,7 @@ def _object(found: Derived) -> str:
 def _goal(found: Derived) -> str:
     goals, starts = found.resets.goals, found.resets.starts
     away = np.linalg.norm(goals - starts, axis=1)
-    up = goals[:, 2] - starts[:, 2]
+    up = np.round(goals[:, 2] - starts[:, 2], 2) + 0.0  # no minus before a zero
     return (
         f"{away.min():.2f} to {away.max():.2f} m from the start, "
         f"{up.min():.2f} to {up.max():.2f} m above it"

@@ -269,6 +269,22 @@ def test_remaining_time_follows_the_steps_of_this_call_alone() -> None:
     assert display.remaining() == pytest.approx(1000 * 20.0 / 100)
 
 
+def test_what_a_finished_run_is_said_to_have_is_its_success(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    display, told = GridDisplay(), []
+    monkeypatch.setattr(display, "say", told.append)
+    for name, kind in (("a", TRAIN), ("object/a", STAGE)):
+        display.expect(name, 1000, 0)
+        display.started(name, kind)
+    figures = {"env_steps": 1000, "success_rate": 0.5, "k_max": 25}
+    display.update("a", {"figures": figures})
+    for name in ("a", "object/a"):
+        display.update(name, {"say": "checkpoint at 1000 env steps: 0.2 MB"})
+        display.ended(name, finished=True)
+    assert told[2:] == ["a: train finished, success 0.50, k_max 25", "object/a: stage finished"]
+
+
 def finished_job(executor: LocalExecutor) -> Message:
     """Wait for the only job's last message."""
     while True:
