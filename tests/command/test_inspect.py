@@ -42,7 +42,7 @@ def test_it_says_what_is_found(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_goal_as_high_as_the_start_is_no_minus_above_it() -> None:
     starts = np.array([[0.0, 0.0, 0.425], [0.1, 0.0, 0.425]])
-    resets = SimpleNamespace(starts=starts, goals=starts + [0.3, 0.0, -1e-6])
+    resets = SimpleNamespace(starts=starts, goals=starts + np.array([0.3, 0.0, -1e-6]))
     told = inspecting._goal(SimpleNamespace(resets=resets))
     assert told.endswith(" m from the start, 0.00 to 0.00 m above it")
 
