@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from ..any_task.derived import Derived, derived
-from ..any_task.scene_picture import draw_points
+from ..any_task.scene_picture import GOAL_RGBA, START_RGBA, draw_points
 from ..any_task.simulation import DerivedObjectVecEnv
 from ..common.reports import Report
 from ..envs import IDS
@@ -62,7 +62,8 @@ def draw_found(env_id: str, out: Path) -> None:
     try:
         env.reset(seed=0)
         starts, goals = found.resets.starts[:_SHOWN], found.resets.goals[:_SHOWN]
-        write_png(out, draw_points(env, starts, goals))
+        colours = np.repeat([START_RGBA, GOAL_RGBA], [len(starts), len(goals)], axis=0)
+        write_png(out, draw_points(env, np.concatenate([starts, goals]), colours))
     finally:
         env.close()
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import arm_and_wall
 import numpy as np
 import pytest
 import toy
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_follow_object.command import demo, films
+from sb3_follow_object.command import demo, films, pictures
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.runs.run_folder import claim
 from sb3_follow_object.settings.presets import run_config
@@ -78,6 +79,20 @@ def test_film_is_in_the_log_at_the_runs_last_step(tmp_path: Path) -> None:
     assert film.step == 1234
     assert (film.width, film.height) == (480, 480)
     assert Image.open(io.BytesIO(film.encoded_image_string)).n_frames == 51
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_imagined_goals_go_from_violet_to_yellow_in_environments_of_others_too(
+    tmp_path: Path,
+) -> None:
+    predictor = toy.StraightPredictor()
+    predictor.horizon = 50
+    pictures.draw_imagined(arm_and_wall.ARM, predictor, tmp_path / "imagined.png")
+    image = np.asarray(Image.open(tmp_path / "imagined.png").convert("RGB")).astype(int)
+    assert image.shape == (480, 3 * 480, 3)
+    red, green, blue = (image[..., channel] for channel in range(3))
+    assert ((red > 2 * blue) & (green > 2 * blue) & (red > 60)).sum() > 50, "the last levels"
+    assert ((red > 2 * green) & (blue > 2 * green) & (blue > 20)).sum() > 10, "the first"
 
 
 @pytest.mark.usefixtures("can_draw")
