@@ -203,7 +203,10 @@ class _Window:
         check_windows()
         running = set(threading.enumerate())
         try:
-            self.viewer = import_module("mujoco.viewer").launch_passive(model, self.data)
+            # Its panels would cover two thirds of the window; Tab and Shift-Tab bring them back.
+            self.viewer = import_module("mujoco.viewer").launch_passive(
+                model, self.data, show_left_ui=False, show_right_ui=False
+            )
         except Exception as error:  # mujoco's errors share no class
             raise RuntimeError(f"No window can be opened here ({error}).") from error
         self._threads = set(threading.enumerate()) - running

@@ -63,6 +63,11 @@ def import_task(env_id: str) -> str:
                 "is it installed, or its folder on PYTHONPATH?"
             ) from error
     elif name not in gym.registry:
-        with redirect_stderr(StringIO()):  # it speaks of other environments' versions
-            import_module("gymnasium_robotics")
+        import_robotics()
     return name
+
+
+def import_robotics() -> None:
+    """Have Gymnasium-Robotics register its tasks, unless it has."""
+    with redirect_stderr(StringIO()):  # it speaks of other environments' versions
+        import_module("gymnasium_robotics")

@@ -22,8 +22,9 @@ from ..common.numbers import checked_whole
 from .batch import cores
 from .copies_worker import __name__ as WORKER
 from .make import make_vec
-from .registration import import_task
+from .registration import import_robotics, import_task
 from .robot_face import RobotTask, needs_face
+from .robotics import is_of_robotics
 from .task_table import IDS
 
 _LEAST = 2  # copies that are worth a process
@@ -83,6 +84,8 @@ def may_be_faced(env: gym.Env) -> bool:
 
 
 def _make(spec: EnvSpec, wrapped: bool, options: dict[str, Any]) -> gym.Env:
+    if is_of_robotics(spec):
+        import_robotics()  # quietly, before gymnasium does so in a process that has not
     env = gym.make(spec, **options)
     if not wrapped:
         return env

@@ -12,7 +12,7 @@ from ..envs.physics_engine import mujoco
 from ..envs.picture import SIZE, add_point, check_process
 from .physics_access import physics_of
 
-START_RGBA, GOAL_RGBA = (0.1, 0.4, 0.9, 0.6), (0.9, 0.1, 0.1, 0.6)
+START_RGBA, GOAL_RGBA = np.array([[0.1, 0.4, 0.9, 0.6], [0.9, 0.1, 0.1, 0.6]])
 _AZIMUTH, _ELEVATION = 132.0, -25.0
 _WIDER = 1.6  # the picture's width, in what the points span
 _LEAST = 0.6  # metres that it shows
@@ -47,15 +47,14 @@ class ScenePicture:
         self._scene = mujoco.MjvScene(model, maxgeom=_MOST_GEOMS)
         self._camera = _camera(points)
 
-    def draw(self, data: mujoco.MjData, starts: np.ndarray, goals: np.ndarray) -> Pixels:
-        """Draw a state with starts (n, 3) in blue and goals (m, 3) in red, in metres."""
+    def draw(self, data: mujoco.MjData, points: np.ndarray, colours: np.ndarray) -> Pixels:
+        """Draw a state with points (n, 3) in metres, each in its colour, (n, 4) in [0, 1]."""
         self._context.make_current()
         scene, everything = self._scene, mujoco.mjtCatBit.mjCAT_ALL
         option = mujoco.MjvOption()
         mujoco.mjv_updateScene(self._model, data, option, None, self._camera, everything, scene)
-        for points, rgba in ((starts, START_RGBA), (goals, GOAL_RGBA)):
-            for point in points:
-                add_point(scene, point, _BALL * self._camera.distance, rgba)
+        for point, rgba in zip(points, colours, strict=True):
+            add_point(scene, point, _BALL * self._camera.distance, rgba)
         image = np.empty((SIZE, SIZE, 3), dtype=np.uint8)
         rectangle = mujoco.MjrRect(0, 0, SIZE, SIZE)
         mujoco.mjr_render(rectangle, scene, self._pen)
@@ -69,16 +68,21 @@ class ScenePicture:
         self._context.free()
 
 
-def draw_points(env: gym.Env, starts: np.ndarray, goals: np.ndarray) -> Pixels:
-    """Draw the state that an environment is in, with starts in blue and goals in red.
+def draw_points(env: gym.Env, points: np.ndarray, colours: np.ndarray) -> Pixels:
+    """Draw the state that an environment is in, with points.
+
+    Args:
+        env: anybody's, with MuJoCo.
+        points: (n, 3) metres, n >= 1; the camera looks at them.
+        colours: of each, (n, 4), red, green, blue and opacity in [0, 1].
 
     Raises:
         RuntimeError: there is no graphics library to draw with.
     """
     model, data = physics_of(env)
-    picture = ScenePicture(model, np.concatenate([starts, goals]))
+    picture = ScenePicture(model, points)
     try:
-        return picture.draw(data, starts, goals)
+        return picture.draw(data, points, colours)
     finally:
         picture.close()
 
@@ -103,7 +107,7 @@ class Drawn(gym.Wrapper):
     def render(self) -> Any:
         """Draw the state."""
         assert self._picture is not None, "reset() comes first"
-        return self._picture.draw(physics_of(self.env)[1], np.zeros((0, 3)), self._goal[None])
+        return self._picture.draw(physics_of(self.env)[1], self._goal[None], GOAL_RGBA[None])
 
     def close(self) -> None:
         """Let environment and graphics go."""

@@ -95,8 +95,7 @@ def _train(args: argparse.Namespace) -> None:
         )
     if not args.quiet:
         row = {name: result[name] for name in ("task", "method", "seed", "k_max")}
-        row |= {"env steps": f"{result['env_steps']:,}", "minutes": result["wall_s"] / 60.0}
-        row["success"] = f"{result['success_rate']:.3f} of {result['episodes']}"
+        row |= {"minutes": result["wall_s"] / 60.0, **_outcome(result)}
         try:
             _print_table(row)
         except OSError as error:
@@ -217,7 +216,17 @@ def _evaluate(args: argparse.Namespace) -> None:
     if args.json:
         print(json.dumps(result))
     else:
-        _print_table(result)
+        row = {name: result[name] for name in ("env", "method", "seed")}
+        _print_table(row | _outcome(result))
+
+
+def _outcome(result: dict[str, Any]) -> dict[str, str]:
+    """Return the columns of a test's result."""
+    steps = result["env_steps"]
+    return {
+        "env steps": "-" if steps is None else f"{steps:,}",
+        "success": f"{result['success_rate']:.3f} of {result['episodes']}",
+    }
 
 
 def _warn(sentence: str) -> None:
@@ -232,7 +241,7 @@ def _watch(args: argparse.Namespace) -> None:
     config = load_config(args.run)
     out = _named(args.out or args.run / VIDEO, ".mp4")
     rate = record(args.run / POLICY, config.env_id, out, args.episodes, args.seed)
-    print(f"{out}: {args.episodes} episodes, success {rate:.2f}")
+    print(f"{out}: success {rate:.2f} of {args.episodes}")
 
 
 def _plot(args: argparse.Namespace) -> None:

@@ -18,7 +18,7 @@ from ..envs import IDS, object_id
 from ..envs.batch import MAX_DISPLACEMENT
 from ..imagination.goal_predictor import GoalPredictor
 from ..runs.run_folder import POLICY, trained_steps
-from .pictures import frame, imagined_way, labelled, make_drawn
+from .pictures import EachStep, frame, imagined_way, labelled, make_drawn, play
 
 _SIDE = 300  # pixels of a panel of the story
 _COLOURS = 256
@@ -54,7 +54,8 @@ def draw_story(
         RuntimeError: there is nothing to draw with, or the robot does not succeed in 20 episodes.
         ValueError: the policy does not fit the task.
     """
-    seed, robot = _success(policy_file, env_id, seed)
+    seed = _first_success(policy_file, env_id, seed)
+    robot = _episode(policy_file, env_id, seed)
     imagined, path = _imagined_frames(predictor, env_id, seed, len(robot))
     alone = _object_frames(env_id, path, seed)
     panels = zip(
@@ -80,7 +81,7 @@ def add_film(run: Path, env_id: str, seed: int = 0) -> None:
         tensorboard = need("torch.utils.tensorboard", "plots")
     except MissingExtra:
         return
-    frames, _ = _episode(run / POLICY, env_id, seed)
+    frames = _episode(run / POLICY, env_id, seed)
     height, width, _ = frames[0].shape
     picture = gif(frames, _FRAME_MS, _HOLD_MS)
     image = summaries.Summary.Image(
@@ -123,31 +124,32 @@ def gif(frames: Sequence[np.ndarray], frame_ms: int, last_ms: int) -> bytes:
     return file.getvalue()
 
 
-def _episode(policy_file: Any, env_id: str, seed: int) -> tuple[list[np.ndarray], bool]:
-    """Play an episode; return its frames and whether it succeeded."""
-    env = make_drawn(env_id)
-    try:
-        actor, _ = load_actor(policy_file, env.observation_space, env.action_space)  # type: ignore[arg-type]
-        obs, info = env.reset(seed=seed)
-        frames, over = [frame(env)], False
-        while not over:
-            action, _ = actor.predict(obs, deterministic=True)
-            obs, _, terminated, truncated, info = env.step(action)
-            frames.append(frame(env))
-            over = terminated or truncated
-        return frames, bool(info["is_success"])
-    finally:
-        env.close()
+def _episode(policy_file: Any, env_id: str, seed: int) -> list[np.ndarray]:
+    """Play an episode; return its frames."""
+    frames: list[np.ndarray] = []
+    _play(policy_file, make_drawn(env_id), [seed], lambda env: frames.append(frame(env)))
+    return frames
 
 
-def _success(policy_file: Any, env_id: str, seed: int) -> tuple[int, list[np.ndarray]]:
+def _first_success(policy_file: Any, env_id: str, seed: int) -> int:
+    """Return the seed of the first episode that succeeds; drawing the tries would take long."""
     if env_id not in IDS:
         raise ValueError(f"{env_id!r} is no task of this package, which the story is drawn of")
-    for each in range(seed, seed + _TRIES):
-        frames, success = _episode(policy_file, env_id, each)
-        if success:
-            return each, frames
-    raise RuntimeError(f"the robot of {policy_file} does not succeed in {_TRIES} episodes")
+    tries = range(seed, seed + _TRIES)
+    success = _play(policy_file, gym.make(env_id), tries, lambda env: None)
+    if success is None:
+        raise RuntimeError(f"the robot of {policy_file} does not succeed in {_TRIES} episodes")
+    return success
+
+
+def _play(policy_file: Any, env: gym.Env, seeds: Sequence[int], each_step: EachStep) -> int | None:
+    """Play an episode of each seed until one succeeds; return its seed, or None."""
+    try:
+        actor, _ = load_actor(policy_file, env.observation_space, env.action_space)  # type: ignore[arg-type]
+        succeeds = (seed for seed in seeds if play(actor, env, 1, seed, each_step))
+        return next(succeeds, None)
+    finally:
+        env.close()
 
 
 def _imagined_frames(

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from ..any_task.derived import Derived, derived
-from ..any_task.scene_picture import draw_points
+from ..any_task.scene_picture import GOAL_RGBA, START_RGBA, draw_points
 from ..any_task.simulation import DerivedObjectVecEnv
 from ..common.reports import Report
 from ..envs import IDS
@@ -62,7 +62,8 @@ def draw_found(env_id: str, out: Path) -> None:
     try:
         env.reset(seed=0)
         starts, goals = found.resets.starts[:_SHOWN], found.resets.goals[:_SHOWN]
-        write_png(out, draw_points(env, starts, goals))
+        colours = np.repeat([START_RGBA, GOAL_RGBA], [len(starts), len(goals)], axis=0)
+        write_png(out, draw_points(env, np.concatenate([starts, goals]), colours))
     finally:
         env.close()
 
@@ -79,7 +80,7 @@ def _object(found: Derived) -> str:
 def _goal(found: Derived) -> str:
     goals, starts = found.resets.goals, found.resets.starts
     away = np.linalg.norm(goals - starts, axis=1)
-    up = goals[:, 2] - starts[:, 2]
+    up = np.round(goals[:, 2] - starts[:, 2], 2) + 0.0  # no minus before a zero
     return (
         f"{away.min():.2f} to {away.max():.2f} m from the start, "
         f"{up.min():.2f} to {up.max():.2f} m above it"

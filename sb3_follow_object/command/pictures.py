@@ -11,12 +11,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ..any_task.scene_picture import Drawn, draw_points
+from ..any_task.scene_picture import GOAL_RGBA, Drawn, draw_points
 from ..common.extras import need
 from ..common.files import atomic_write
 from ..ddpg.actor_files import load_actor
 from ..envs import IDS, TASKS
 from ..envs.graphics import find_graphics
+from ..envs.picture import marker_colours
 from ..envs.robot_copies import robot_maker
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.imagined_goals import points_along
@@ -104,10 +105,16 @@ def draw_imagined(
                 env.unwrapped.set_markers(way)  # type: ignore[attr-defined]
                 panels.append(frame(env))
             else:
-                panels.append(draw_points(env, way, obs["desired_goal"][None]))
+                panels.append(_imagined_elsewhere(env, way, obs["desired_goal"]))
         write_png(out, np.concatenate(panels, axis=1))
     finally:
         env.close()
+
+
+def _imagined_elsewhere(env: gym.Env, way: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Draw imagined goals (n, 3) and a goal (3,), in metres, in an environment of others."""
+    levels = np.column_stack([marker_colours(len(way)), np.ones(len(way))])
+    return draw_points(env, np.vstack([way, goal]), np.vstack([levels, GOAL_RGBA]))
 
 
 def imagined_way(predictor: GoalPredictor, obs: dict[str, np.ndarray]) -> np.ndarray:
@@ -170,7 +177,7 @@ def play(
     n_episodes: int,
     seed: int,
     each_step: EachStep,
-    each_episode: EachEpisode,
+    each_episode: EachEpisode = lambda episode, success: None,
 ) -> float:
     """Play noise-free episodes and return their success rate.
 

@@ -39,7 +39,6 @@ def run(args: argparse.Namespace) -> None:
 def _pictures(run: Path, drawn: Path) -> dict[str, Path]:
     """Return a run's pictures by their titles; those that it has none of are drawn."""
     from ..common.reports import reason
-    from ..envs import IDS
     from ..imagination.goal_predictor import GoalPredictor
     from ..runs.object_stage_files import PREDICTOR
     from ..runs.run_folder import POLICY
@@ -54,7 +53,7 @@ def _pictures(run: Path, drawn: Path) -> dict[str, Path]:
     for name, title in titles.items():
         needed = run / (PREDICTOR if name == IMAGINED else POLICY)
         path = run / name
-        if not path.exists() and needed.exists() and (env_id in IDS or name == VIDEO):
+        if not path.exists() and needed.exists():
             path = drawn / name
             try:
                 if name == IMAGINED:

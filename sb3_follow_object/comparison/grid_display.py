@@ -66,7 +66,7 @@ class GridDisplay(NoCopies):
 
     def started(self, name: str, kind: str) -> None:
         """Show a job from now on."""
-        self._running[name] = {"kind": kind, "env_steps": None, "text": ""}
+        self._running[name] = {"kind": kind, "env_steps": None, "text": "", "outcome": ""}
         if self._started is None:
             self._started = self._clock()
         if not self._console.is_terminal:
@@ -91,6 +91,7 @@ class GridDisplay(NoCopies):
         rate, k_max = figures["success_rate"], figures["k_max"]
         row["text"] = "success " + ("-" if rate is None else f"{rate:.2f}")
         row["text"] += "" if k_max is None else f", k_max {k_max}"
+        row["outcome"] = row["text"]
 
     def ended(self, name: str, finished: bool = False) -> None:
         """Show a job no more."""
@@ -98,7 +99,7 @@ class GridDisplay(NoCopies):
         if finished:
             self._left[name] = 0
             if not self._console.is_terminal:
-                self.say(f"{name}: {row['kind']} finished{_after(row['text'])}")
+                self.say(f"{name}: {row['kind']} finished{_after(row['outcome'])}")
 
     def remaining(self) -> float | None:
         """Return about how many seconds the rest will take at the speed so far; None at first."""

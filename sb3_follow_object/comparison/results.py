@@ -263,7 +263,7 @@ def markdown_table(groups: Sequence[Group]) -> str:
     lines = [f"| task | {' | '.join(methods)} |", "|---" * (len(methods) + 1) + "|"]
     for task in dict.fromkeys(group.task for group in groups):
         lines.append(f"| {task} | {' | '.join(cells[task, method] for method in methods)} |")
-    lines += ["", "Median [quartiles] of the final success over finished seeds."]
+    lines += ["", "Median [quartiles] of the final success (over this many finished seeds)."]
     return "\n".join([*lines, *_aggregate_lines(groups), *_failure_lines(groups)]) + "\n"
 
 

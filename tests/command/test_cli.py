@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_runs import TINY
+from short_films import record_an_episode
 
+from sb3_follow_object.command import pictures
 from sb3_follow_object.command.cli import _print_table, main
 from sb3_follow_object.common import extras
 from sb3_follow_object.common.files import LOCK
@@ -28,7 +30,7 @@ from sb3_follow_object.runs.progress import ProgressBar, Terminal
 from sb3_follow_object.runs.run_folder import check_empty
 
 TASK = "FollowObject/PushSideGap-v0"
-START = ["train", "--env", TASK, "--steps", "3000", "--n-envs", "2", "--threads", "1"]
+START = ["train", "--env", TASK, "--steps", "2200", "--n-envs", "2", "--threads", "1"]
 START += ["--seed", "3", "--set", *TINY]
 
 
@@ -64,6 +66,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ProgressBar, "update", interrupt)
+        patch.setattr(pictures, "record", record_an_episode)
         assert main([*START, "--run", str(folder)]) == 130
         assert not (folder / "result.json").exists()
         assert main(["train", "--run", str(folder), "--resume"]) == 0
@@ -82,7 +85,7 @@ def test_run_folder_holds_all_that_was_promised(finished: Path) -> None:
     assert not [name for name in names if name.startswith("checkpoint")]
     assert {name for name in names if name.startswith(".")} == {".lock"}, "half-written files"
     result = json.loads((finished / "result.json").read_text())
-    assert result["env_steps"] >= 3000
+    assert result["env_steps"] >= 2200
     assert result["command"] == shlex.join(["sb3-follow-object", *START, "--run", str(finished)])
 
 
@@ -100,6 +103,19 @@ def test_evaluation_repeats_the_final_test(
         "success_rate": result["success_rate"],
         "env_steps": result["env_steps"],
     }
+
+
+def test_evaluation_is_a_table_of_a_line_in_eighty_columns(
+    finished: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    status, out, _ = run(capsys, "evaluate", finished, "--episodes", 4)
+    assert status == 0
+    (row,) = (line for line in out.splitlines() if TASK in line)
+    steps = json.loads((finished / "result.json").read_text())["env_steps"]
+    cells = [cell.strip() for cell in row.strip("│").split("│")]
+    assert cells[:4] == [TASK, "fo", "3", f"{steps:,}"]
+    assert cells[4].endswith(" of 4")
 
 
 def test_policy_and_config_alone_can_be_evaluated(
@@ -227,7 +243,7 @@ def test_watch_and_plot_write_where_they_are_told(
     video = tmp_path / "video.mp4"
     status, out, _ = run(capsys, "watch", finished, "--episodes", 1, "--out", video)
     assert (status, video.read_bytes()[4:8]) == (0, b"ftyp")
-    assert str(video) in out
+    assert out.startswith(f"{video}: success ") and out.endswith(" of 1\n")
     figure = tmp_path / "curve.png"
     assert run(capsys, "plot", finished, finished, "--out", figure)[0] == 0
     assert figure.read_bytes().startswith(b"\x89PNG")

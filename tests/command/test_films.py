@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import arm_and_wall
 import numpy as np
 import pytest
 import toy
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_follow_object.command import demo, films
+from sb3_follow_object.command import demo, films, pictures
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.runs.run_folder import claim
 from sb3_follow_object.settings.presets import run_config
@@ -50,6 +51,24 @@ def test_story_shows_object_goals_and_robot(tmp_path: Path) -> None:
         assert (np.abs(parts[0] - parts[1]).max(axis=-1) > 60).sum() > 50
 
 
+def test_story_of_a_robot_that_never_succeeds_is_refused_before_anything_is_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds = []
+
+    def miss(actor: object, env: object, n_episodes: int, seed: int, each_step: object) -> float:
+        seeds.append(seed)
+        return 0.0
+
+    monkeypatch.setattr(films, "play", miss)
+    monkeypatch.setattr(films, "frame", lambda env: pytest.fail("it was drawn"))
+    policy, out = demo.demo_policy("PnPShelf"), tmp_path / "story.gif"
+    with pytest.raises(RuntimeError, match="does not succeed in 20 episodes"):
+        films.draw_story(policy, toy.StraightPredictor(), TASK, out, seed=100)
+    assert seeds == list(range(100, 120))
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.usefixtures("can_draw")
 def test_film_is_in_the_log_at_the_runs_last_step(tmp_path: Path) -> None:
     (tmp_path / "policy.safetensors").write_bytes(demo.demo_policy("PnPShelf").read_bytes())
@@ -60,6 +79,20 @@ def test_film_is_in_the_log_at_the_runs_last_step(tmp_path: Path) -> None:
     assert film.step == 1234
     assert (film.width, film.height) == (480, 480)
     assert Image.open(io.BytesIO(film.encoded_image_string)).n_frames == 51
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_imagined_goals_go_from_violet_to_yellow_in_environments_of_others_too(
+    tmp_path: Path,
+) -> None:
+    predictor = toy.StraightPredictor()
+    predictor.horizon = 50
+    pictures.draw_imagined(arm_and_wall.ARM, predictor, tmp_path / "imagined.png")
+    image = np.asarray(Image.open(tmp_path / "imagined.png").convert("RGB")).astype(int)
+    assert image.shape == (480, 3 * 480, 3)
+    red, green, blue = (image[..., channel] for channel in range(3))
+    assert ((red > 2 * blue) & (green > 2 * blue) & (red > 60)).sum() > 50, "the last levels"
+    assert ((red > 2 * green) & (blue > 2 * green) & (blue > 20)).sum() > 10, "the first"
 
 
 @pytest.mark.usefixtures("can_draw")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import arm_and_wall
 import imageio.v3 as imageio
+import numpy as np
 import pytest
 
 from sb3_follow_object.any_task import derived as looking
@@ -36,6 +38,13 @@ def test_it_says_what_is_found(capsys: pytest.CaptureFixture[str]) -> None:
     assert facts["moves"].startswith("on its surface")
     assert facts["episodes"] == "50 steps; the object's 50"
     assert "where 60 episodes of ArmAndWall-v0 begin is recorded, once" in told.err
+
+
+def test_a_goal_as_high_as_the_start_is_no_minus_above_it() -> None:
+    starts = np.array([[0.0, 0.0, 0.425], [0.1, 0.0, 0.425]])
+    resets = SimpleNamespace(starts=starts, goals=starts + np.array([0.3, 0.0, -1e-6]))
+    told = inspecting._goal(SimpleNamespace(resets=resets))
+    assert told.endswith(" m from the start, 0.00 to 0.00 m above it")
 
 
 def test_it_draws_starts_and_goals(can_draw: None, tmp_path: Path) -> None:

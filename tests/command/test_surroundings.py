@@ -22,6 +22,7 @@ from sb3_follow_object.runs import experiment, stages
 from sb3_follow_object.runs.progress import ProgressBar, Terminal
 
 PICTURES = ("curve.png", "task.png", "video.mp4")
+SUPPORT = str(Path(__file__).parents[1] / "support")
 OF_GRAPHICS = {"MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM"}
 
 
@@ -62,7 +63,8 @@ def holds(folder: Path) -> set[str]:
 
 @pytest.mark.usefixtures("can_draw")
 def test_a_dead_screen_costs_no_picture(run: Path) -> None:
-    status, out, err = command("train", "--resume", "--run", run, DISPLAY=":99")
+    films = {"module": "short_films", "PYTHONPATH": SUPPORT}
+    status, out, err = command("train", "--resume", "--run", run, DISPLAY=":99", **films)
     assert status == 0 and holds(run) == set(PICTURES)
     assert "0.000 of 8" in out and "left out" not in out
     assert "glfw does not draw here (X11: Failed to open display :99); drawing with" in err

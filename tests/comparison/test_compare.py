@@ -18,6 +18,7 @@ from result_folders import finish
 
 from sb3_follow_object.command import cli
 from sb3_follow_object.common.files import lock
+from sb3_follow_object.comparison import figures
 from sb3_follow_object.comparison.cells import Cell, Settings, prepare
 from sb3_follow_object.comparison.compare import Comparison, share_cores
 from sb3_follow_object.comparison.cross import CROSS_TESTS
@@ -268,6 +269,22 @@ def test_remaining_time_follows_the_steps_of_this_call_alone() -> None:
     assert display.remaining() == pytest.approx(1000 * 20.0 / 100)
 
 
+def test_what_a_finished_run_is_said_to_have_is_its_success(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    display, told = GridDisplay(), []
+    monkeypatch.setattr(display, "say", told.append)
+    for name, kind in (("a", TRAIN), ("object/a", STAGE)):
+        display.expect(name, 1000, 0)
+        display.started(name, kind)
+    figures = {"env_steps": 1000, "success_rate": 0.5, "k_max": 25}
+    display.update("a", {"figures": figures})
+    for name in ("a", "object/a"):
+        display.update(name, {"say": "checkpoint at 1000 env steps: 0.2 MB"})
+        display.ended(name, finished=True)
+    assert told[2:] == ["a: train finished, success 0.50, k_max 25", "object/a: stage finished"]
+
+
 def finished_job(executor: LocalExecutor) -> Message:
     """Wait for the only job's last message."""
     while True:
@@ -324,12 +341,15 @@ def test_real_run_is_stopped_resumed_and_ends(
 
     monkeypatch.setattr(GridDisplay, "update", stop_at_once)
     run = tmp_path / "PushSideGap-her-5"
-    assert cli.main(words) == 130
+    with monkeypatch.context() as patch:
+        patch.setattr(figures, "draw_results", lambda *arguments: [])
+        assert cli.main(words) == 130
     assert "the same command goes on" in capsys.readouterr().err
     assert not (run / RESULT).exists()
     assert list(run.glob("checkpoint*")), "it was stopped without a checkpoint"
     assert "unfinished" in (tmp_path / "table.md").read_text()
     assert cli.main(words) == 0
+    assert list((tmp_path / "figures").glob("*.png"))
     printed = capsys.readouterr()
     assert "resumed at" in (tmp_path / "logs" / "PushSideGap-her-5.log").read_text()
     assert "| PushSideGap | " in printed.out

@@ -14,7 +14,7 @@ import pytest
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.common import extras
 from sb3_follow_object.common.files import lock
-from sb3_follow_object.comparison import ray_executor
+from sb3_follow_object.comparison import figures, ray_executor
 from sb3_follow_object.comparison.ray_executor import RayExecutor, _write_files
 from sb3_follow_object.comparison.worker import TRAIN, Job
 
@@ -44,6 +44,12 @@ def cluster() -> Iterator[Any]:
     finally:
         ray.shutdown()
         nodes.shutdown()
+
+
+@pytest.fixture(autouse=True)
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are drawn here, not on the nodes, and take longer than the runs."""
+    monkeypatch.setattr(figures, "draw_results", lambda *arguments: [])
 
 
 def test_grid_runs_on_two_nodes_and_its_files_come_back(

@@ -17,6 +17,7 @@ import pytest
 from cli_runs import TINY
 from gymnasium.utils.env_checker import check_env
 
+from sb3_follow_object.command.cli import main
 from sb3_follow_object.comparison.cells import Settings
 from sb3_follow_object.comparison.grid import plan
 from sb3_follow_object.envs import (
@@ -43,7 +44,7 @@ SUPPORT = str(Path(__file__).parents[1] / "support")  # where that lies
 NAME = "PushPast"
 OWN = f"FollowObject/{NAME}-v0"
 FULL = f"{MODULE}:{OWN}"
-MAIN = "import sys; from sb3_follow_object.command.cli import main; sys.exit(main())"
+MAIN = "import sys; from sb3_follow_object.command.cli import main"
 FEW_COPIES = "import tiny_runs; tiny_runs.evaluate_in_few_copies(); "
 NEAR = Region("gripper", (-0.15, -0.15), (0.15, 0.0))
 FAR = Region("gripper", (-0.10, 0.15), (0.10, 0.25))
@@ -170,27 +171,30 @@ def test_module_that_cannot_be_imported_is_named() -> None:
         run_config("no_such_module:FollowObject/PushPast-v0")
 
 
-def test_commands_train_resume_and_test_it_in_processes_of_their_own(tmp_path: Path) -> None:
+def test_commands_train_resume_and_test_it_in_processes_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "disable")  # films take longer than the rest
     env = {**os.environ, "PYTHONPATH": SUPPORT, "PYTHONWARNINGS": "ignore"}
-    env["MUJOCO_GL"] = "disable"  # films take longer than the rest
 
-    def command(*words: object) -> subprocess.CompletedProcess[str]:
+    def commands(*lines: list[str]) -> subprocess.CompletedProcess[str]:
+        """Command lines one after the other, until one fails, in a process of their own."""
         code = FEW_COPIES + MAIN if "PYTHONPATH" in env else MAIN
-        line = [sys.executable, "-c", code, *map(str, words)]
+        code += f"; sys.exit({' or '.join(f'main({words})' for words in lines)})"
+        line = [sys.executable, "-c", code]
         return subprocess.run(line, env=env, cwd=tmp_path, capture_output=True, text=True)
 
-    run = tmp_path / "run"
+    run = str(tmp_path / "run")
+    train, test = ["train", "--env", FULL, "--run", run], ["evaluate", run, "--episodes", "4"]
     small = ["--n-envs", "2", "--threads", "1", "--set", *TINY]
     small += ["keep_last_checkpoint=true", "eval_every=100000"]
-    done = command("train", "--env", FULL, "--run", run, "--steps", "2400", *small)
-    assert done.returncode == 0, done.stderr
-    done = command("train", "--run", run, "--env", FULL, "--resume", "--steps", "3000")
-    assert done.returncode == 0, done.stderr
-    done = command("evaluate", run, "--episodes", "4")
+    assert main([*train, "--steps", "2200", *small]) == 0
+    forget()
+    done = commands([*train, "--resume", "--steps", "2400"], test)
     assert done.returncode == 0, done.stderr
     assert NAME in done.stdout
     env.pop("PYTHONPATH")
-    done = command("evaluate", run, "--episodes", "4")
+    done = commands(test)
     assert done.returncode == 2 and "on PYTHONPATH" in done.stderr
 
     # And through Python, where the configuration tells the module.

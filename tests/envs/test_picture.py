@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
+
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -67,3 +71,19 @@ def test_robot_is_seen_through_while_markers_are_shown() -> None:
     upper_middle = (slice(0, 160), slice(200, 280))  # where the arm is
     assert (through[upper_middle] != solid[upper_middle]).any(axis=-1).mean() > 0.3
     assert (through[320:] == solid[320:]).all()  # the table's front
+
+
+def test_window_shows_the_robot_and_not_the_viewers_panels(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: dict[str, bool] = {}
+
+    def launch_passive(model: Any, data: Any, **panels: bool) -> MagicMock:
+        shown.update(panels)
+        return MagicMock(cam=mujoco.MjvCamera(), user_scn=mujoco.MjvScene(model, 1000))
+
+    viewer = SimpleNamespace(launch_passive=launch_passive)
+    monkeypatch.setattr(picture, "check_windows", lambda: None)
+    monkeypatch.setattr(picture, "import_module", lambda name: viewer)
+    env = gym.make("FollowObject/PnPShelf-v0", render_mode="human")
+    env.reset(seed=0)
+    env.close()
+    assert shown == {"show_left_ui": False, "show_right_ui": False}

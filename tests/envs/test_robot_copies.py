@@ -11,7 +11,14 @@ import pytest
 import toy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_follow_object.envs.robot_copies import ProcessVecEnv, robot_vec_env
+from sb3_follow_object.envs.robot_copies import ProcessVecEnv, robot_maker, robot_vec_env
+
+
+def test_processes_say_nothing_of_other_environments_versions(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    ProcessVecEnv(robot_maker("FetchReach-v4"), 1, 1).close()
+    assert capfd.readouterr() == ("", "")
 
 
 class Breaks(toy.PointEnv):

@@ -34,7 +34,7 @@ def few_resets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_save_goes_on_as_the_whole_does(tmp_path: Path) -> None:
-    settings = {**TINY, "reach": {}}
+    settings = {**TINY, "reach": {"n_updates": 3, "batch_size": 16}}
     whole = FollowObject(ARM, **settings).learn(3200)
     part = FollowObject(ARM, **settings).learn(2800)
     assert part.model is not None and part.settings["reach"]["effector"] == (0, 1, 2)

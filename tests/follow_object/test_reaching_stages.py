@@ -17,6 +17,7 @@ from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.reach.approach import BEHIND
 from sb3_follow_object.reach.vec_env import ReachFirstVecEnv
+from sb3_follow_object.runs import evaluation
 from sb3_follow_object.runs.checkpoints import checkpoint_files
 from sb3_follow_object.runs.experiment import train
 
@@ -120,9 +121,12 @@ def test_run_folder_stopped_in_the_robots_stage_resumes_exactly(tmp_path: Path) 
     assert runs.outcome(folder) == runs.outcome(tmp_path / "whole")
 
 
-def test_environments_that_cannot_tell_their_state_resume_exactly(tmp_path: Path) -> None:
+def test_environments_that_cannot_tell_their_state_resume_exactly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("gymnasium_robotics")
-    tiny = {**runs.TINY, "imagine": False, "n_threads": None, "reach": REACH}
+    monkeypatch.setattr(evaluation, "_COPIES", 1)  # each takes as long as two rollouts to make
+    tiny = {**runs.TINY, "imagine": False, "reach": REACH}
     short = {"total_timesteps": 400, "eval_every": 10**6, "n_final_episodes": 1}
     config = replace(runs.config(env_id="FetchPush-v4", **short), settings=tiny)
     runs.run(tmp_path / "whole", config=config)

@@ -2,10 +2,13 @@
 
 import zipfile
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 
 import pytest
-from tree import PACKAGES, run
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from tree import PACKAGES, ROOT, run
 
 import sb3_follow_object
 
@@ -32,6 +35,22 @@ obs, info = env.reset(seed=0)
 obs, reward, _, _, info = env.step(env.action_space.sample())
 assert reward == env.unwrapped.compute_reward(obs["achieved_goal"], obs["desired_goal"], info)
 """
+
+
+@pytest.mark.parametrize("python", ["3.10.0", "3.11.2", "3.12.0", "3.13.0", "3.14.0"])
+def test_no_pin_asks_a_python_for_what_it_cannot_install(python: str) -> None:
+    """Debian 12 has 3.11.2; a pin that a Python is too old for makes pip refuse the whole."""
+    here = {"python_full_version": python, "python_version": python.rpartition(".")[0]}
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [Requirement(line) for line in lines if not line.startswith("#")]
+    for pin in pins:
+        if pin.marker is not None and not pin.marker.evaluate(here):
+            continue
+        try:
+            wanted = metadata(pin.name).get("Requires-Python", "")
+        except PackageNotFoundError:  # of the extra `bench`
+            continue
+        assert python in SpecifierSet(wanted), f"{pin} needs Python {wanted}"
 
 
 def test_wheel_holds_every_file_of_the_tree_under_one_name(wheel: Path) -> None:

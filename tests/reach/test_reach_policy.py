@@ -82,7 +82,7 @@ def test_learns_to_bring_the_effector_to_the_object() -> None:
 
 
 def test_learns_to_reach_in_the_simulation() -> None:
-    env = ReachFirstVecEnv(make_vec("FollowObject/PnPSimpleV1-v0", 16, 1))
+    env = ReachFirstVecEnv(make_vec("FollowObject/PnPSimpleV1-v0", 8, 1))
     env.seed(0)
     taught(env, 50, 20)
     assert success(env, 50, 3) > 0.9

@@ -48,6 +48,7 @@ TINY_STAGES: dict[str, Any] = {
     "inverse_fit.updates": 20,
     "n_test_episodes": 2,
 }
+TINY_REACHING: dict[str, Any] = {"reach.n_updates": 3, "reach.batch_size": 16}
 RUNS = ("whole", "part")
 # What a method adds to the log of a run.
 LOGGED = {
@@ -63,10 +64,12 @@ OBJECT_STEPS = {"sldr": 800, "fo-sldr": 800 + 8 * 50}
 
 
 def tiny_run(method: str) -> RunConfig:
-    if "sldr" not in method:
-        return run_config(TASK, method=method, overrides=TINY)
-    stages = {**TINY_STAGES, "n_timesteps": ROBOT_STEPS + OBJECT_STEPS[method]}
-    return run_config(TASK, method=method, overrides={**TINY, **stages})
+    overrides = dict(TINY)
+    if method in ("fo-sldr", "rher"):
+        overrides |= TINY_REACHING
+    if "sldr" in method:
+        overrides |= {**TINY_STAGES, "n_timesteps": ROBOT_STEPS + OBJECT_STEPS[method]}
+    return run_config(TASK, method=method, overrides=overrides)
 
 
 def quiet(sentence: str) -> None:

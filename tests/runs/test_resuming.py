@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -299,6 +298,8 @@ def test_killed_runs_resume(whole: dict[str, Any], tmp_path: Path) -> None:
     benchmarks/kill_test.py does the same twenty times at random moments.
     """
     folder = tmp_path / "run"
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([runs.__name__])  # what it imports takes longer than the run
     marks = [
         lambda: len(checkpoint_files(folder)) > 0,
         lambda: bool(list(folder.glob(".checkpoint*.tmp"))),
@@ -307,17 +308,13 @@ def test_killed_runs_resume(whole: dict[str, Any], tmp_path: Path) -> None:
     for again, mark in enumerate(marks):
         for half_written in folder.glob(".*.tmp"):  # of a kill before; the run itself removes them
             half_written.unlink()
-        code = "import sys, tiny_runs as runs; from pathlib import Path; "
-        code += "runs.evaluate_in_few_copies(); "
-        code += f"runs.run(Path(sys.argv[1]), resume={again > 0})"
-        process = subprocess.Popen(
-            [sys.executable, "-c", code, str(folder)], cwd=Path(__file__).parents[1] / "support"
-        )
+        process = context.Process(target=runs.run_in_few_copies, args=(folder, again > 0))
+        process.start()
         while not mark():
-            assert process.poll() is None, "the run ended before it could be killed"
+            assert process.is_alive(), "the run ended before it could be killed"
             time.sleep(0.0005)
         process.kill()
-        process.wait()
+        process.join()
     runs.run(folder, resume=True)
     assert runs.outcome(folder) == whole
     assert not list(folder.glob(".*.tmp"))

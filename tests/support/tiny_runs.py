@@ -64,6 +64,12 @@ def run(folder: Path, **options: Any) -> dict[str, Any]:
     return experiment.train(options.pop("config", config()), folder, report=quiet, **options)
 
 
+def run_in_few_copies(folder: Path, resume: bool) -> None:
+    """Train the tiny run in a folder; a process of its own begins here."""
+    evaluate_in_few_copies()
+    run(folder, resume=resume)
+
+
 def outcome(folder: Path) -> dict[str, Any]:
     """All that must not depend on where a run was interrupted."""
     result = json.loads((folder / "result.json").read_text())
