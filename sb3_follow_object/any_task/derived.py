@@ -18,9 +18,11 @@ from ..envs.physics_engine import mujoco
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
 from ..envs.robot_face import POSITION, RobotTask, rewards_on_and_off
+from .context import context_of
 from .finding import Candidate, Observed, candidates, find_effector, find_object, observe
 from .physics_access import physics_of
 from .resets import Resets, record_resets, varying_bodies
+from .robot_parts import body_name
 from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of
 
 N_RESETS = 2000  # episodes that are recorded; of a hundred F_phi does not learn the places between
@@ -43,6 +45,7 @@ class Derived:
         horizon: T of the robot's episodes.
         success_distance: metres within which a goal is reached in every direction.
         varying: names of what stands elsewhere in each episode.
+        context: numbers of places, of these or of what can move, that nu and F_phi see.
         shifted: whether rewards of 1 and 0 are shown as 0 and -1.
         physics: hash of what decides how the object moves and where goals lie.
         resets: recorded.
@@ -56,6 +59,7 @@ class Derived:
     horizon: int
     success_distance: float
     varying: tuple[str, ...]
+    context: tuple[str, ...]
     shifted: bool
     physics: str
     resets: Resets
@@ -144,6 +148,7 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
     physics = physics_digest_of(model, found.body, found.offset, few, drawn)
     resets = _kept_resets(env_id, env, physics, report)
     task = DerivedTask(env_id, object_horizon(horizon), physics)
+    context = context_of(model, resets, found.body)
     return Derived(
         env_id,
         found,
@@ -151,11 +156,12 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
         find_effector(seen),
         horizon,
         within,
-        tuple(str(model.body(body).name) for body in sorted(varying_bodies(model, resets))),
+        tuple(body_name(model, body) for body in sorted(varying_bodies(model, resets))),
+        context,
         bool(isinstance(env, RobotTask) and env.shifted),
         physics,
         resets,
-        object_scene_of(model, data, found.body, found.offset, resets, task, within),
+        object_scene_of(model, data, found.body, found.offset, resets, task, within, context),
     )
 
 

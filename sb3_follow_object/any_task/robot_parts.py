@@ -1,4 +1,4 @@
-"""Which bodies of a compiled model are the robot's, and which move with each other."""
+"""Which bodies of a compiled model are the robot's, which move with each other, which touch."""
 
 from __future__ import annotations
 
@@ -50,6 +50,14 @@ def rigid_group(model: mujoco.MjModel, body: int) -> np.ndarray:
 def body_name(model: mujoco.MjModel, body: int) -> str:
     """A body's name, or "body 7" where it has none."""
     return str(model.body(body).name) or f"body {body}"
+
+
+def touching_geoms(model: mujoco.MjModel) -> np.ndarray:
+    """Whether each geom can touch anything, bool (ngeom,)."""
+    touching: np.ndarray = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    touching[model.pair_geom1] = True
+    touching[model.pair_geom2] = True
+    return touching
 
 
 def _driven(model: mujoco.MjModel) -> set[int]:

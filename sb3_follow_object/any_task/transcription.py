@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..envs.physics_engine import mujoco
-from .robot_parts import robot_bodies
+from .robot_parts import body_name, robot_bodies, touching_geoms
 
 JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
 _EQUALITIES = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_JOINT)
@@ -65,7 +65,7 @@ def transcribe(
     copied = Transcription(spec)
     _copy_options(model, spec)
     meshes: dict[tuple[str, int], str] = {}
-    touching, robot = _touching(model), robot_bodies(model)
+    touching, robot = touching_geoms(model), robot_bodies(model)
     for body in np.flatnonzero(~robot):
         added = _add_body(model, data, int(body), varying, copied)
         first = int(model.body_geomadr[body])
@@ -91,14 +91,6 @@ def _copy_options(model: mujoco.MjModel, spec: mujoco.MjSpec) -> None:
     spec.option.disableflags &= ~(int(off.mjDSBL_EQUALITY) | int(off.mjDSBL_CONSTRAINT))
 
 
-def _touching(model: mujoco.MjModel) -> np.ndarray:
-    """Whether each geom can touch anything, bool (ngeom,)."""
-    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    touching[model.pair_geom1] = True
-    touching[model.pair_geom2] = True
-    return touching
-
-
 def _add_body(
     model: mujoco.MjModel,
     data: mujoco.MjData,
@@ -111,7 +103,7 @@ def _add_body(
     if body == 0:
         copied.bodies[0] = "world"
         return world
-    name = copied.bodies[body] = model.body(body).name or f"body:{body}"
+    name = copied.bodies[body] = body_name(model, body)
     if model.body_weldid[body] == 0:
         mocap = body in varying or model.body_mocapid[body] >= 0
         added = world.add_body(

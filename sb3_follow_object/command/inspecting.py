@@ -41,7 +41,7 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
         "object": _object(found),
         "goal": _goal(found),
         "reached": f"within {found.success_distance * 1e3:.0f} mm" + _shifted(found),
-        "varies": ", ".join(found.varying) or "nothing but object and goal",
+        "varies": _varies(found),
         "moves": "on its surface, unless it does not learn so" if found.on_surface else "freely",
         "effector": _effector(found),
         "episodes": f"{found.horizon} steps; the object's {found.scene.task.horizon}",
@@ -84,6 +84,18 @@ def _goal(found: Derived) -> str:
         f"{away.min():.2f} to {away.max():.2f} m from the start, "
         f"{up.min():.2f} to {up.max():.2f} m above it"
     )
+
+
+def _varies(found: Derived) -> str:
+    """What stands elsewhere in each episode, and whether nu and F_phi need to see where."""
+    seen: dict[str, list[str]] = {}
+    for name in found.context:
+        body, number = name.rsplit(" ", 1)
+        seen.setdefault(body, []).append(number)
+    told = ", ".join(f"{body} ({', '.join(numbers)})" for body, numbers in seen.items())
+    others = ", ".join(name for name in found.varying if name not in seen)
+    parts = (told and f"{told}: seen by nu and F_phi", others and f"{others}: need not be seen")
+    return "; ".join(part for part in parts if part) or "nothing but object and goal"
 
 
 def _shifted(found: Derived) -> str:

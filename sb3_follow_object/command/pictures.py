@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..any_task.context import read_context
 from ..any_task.scene_picture import Drawn, draw_points
 from ..common.extras import need
 from ..common.files import atomic_write
@@ -99,7 +100,7 @@ def draw_imagined(
         panels = []
         for panel in range(_PANELS):
             obs, _ = env.reset(seed=seed + panel)
-            way = imagined_way(predictor, obs)
+            way = imagined_way(predictor, obs, read_context(predictor.context, env))
             if env_id in IDS:
                 env.unwrapped.set_markers(way)  # type: ignore[attr-defined]
                 panels.append(frame(env))
@@ -110,9 +111,18 @@ def draw_imagined(
         env.close()
 
 
-def imagined_way(predictor: GoalPredictor, obs: dict[str, np.ndarray]) -> np.ndarray:
-    """Imagined goals (25, 3), evenly along the way from where an episode begins to its goal."""
-    paths = predictor.paths(obs["achieved_goal"][None], obs["desired_goal"][None])
+def imagined_way(
+    predictor: GoalPredictor, obs: dict[str, np.ndarray], context: np.ndarray
+) -> np.ndarray:
+    """Imagined goals (25, 3), evenly along the way from where an episode begins to its goal.
+
+    Args:
+        predictor: F_phi.
+        obs: that an episode begins with.
+        context: what F_phi sees beside it, (c,).
+    """
+    start, goal = obs["achieved_goal"][None], obs["desired_goal"][None]
+    paths = predictor.paths(start, goal, context[None])
     way: np.ndarray = points_along(paths, np.arange(1, _LEVELS + 1) / _LEVELS)[0]
     return way
 

@@ -16,6 +16,7 @@ def imagine(
     start: np.ndarray,
     goal: np.ndarray,
     level: np.ndarray,
+    contexts: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the imagined goals h of given levels (paper, section 4.3).
 
@@ -25,6 +26,7 @@ def imagine(
         start: object positions o_1, shape (n, 3), metres.
         goal: original goals g, shape (n, 3), metres.
         level: shape (n,) int, in 1..curriculum.n_levels.
+        contexts: where other things stand, shape (n, c); None where F_phi sees none.
 
     Returns:
         h, shape (n, 3) float64, metres.
@@ -36,9 +38,9 @@ def imagine(
     if level.size and not (level.min() >= 1 and level.max() <= curriculum.n_levels):
         raise ValueError(f"Levels must lie in 1..{curriculum.n_levels}, got {level.tolist()}.")
     if curriculum.levels == "time":
-        imagined = predictor.predict(start, goal, level)
+        imagined = predictor.predict(start, goal, level, contexts)
     else:
-        levels = _all_levels(predictor, curriculum, start, goal)
+        levels = _all_levels(predictor, curriculum, start, goal, contexts)
         imagined = levels[np.arange(len(level)), level - 1]
     check_shape(imagined, np.shape(start), "the goals that the predictor imagines")
     return imagined
@@ -51,6 +53,7 @@ def draw_goals(
     start: np.ndarray,
     goal: np.ndarray,
     rng: np.random.Generator,
+    contexts: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw the goal that each of n new training episodes shows (paper, Algorithm 1).
 
@@ -64,6 +67,7 @@ def draw_goals(
         start: object positions o_1, shape (n, 3), metres.
         goal: original goals g, shape (n, 3), metres.
         rng: source of randomness.
+        contexts: as in `imagine`.
 
     Returns:
         shown goals, shape (n, 3) float64, metres; levels, shape (n,) int64, 0 where original.
@@ -74,12 +78,17 @@ def draw_goals(
     rows = np.flatnonzero(~original)
     if not rows.size:
         return shown, level
-    shown[rows] = imagine(predictor, curriculum, start[rows], goal[rows], level[rows])
+
+    def seen(rows: np.ndarray) -> np.ndarray | None:
+        return None if contexts is None else contexts[rows]
+
+    shown[rows] = imagine(predictor, curriculum, start[rows], goal[rows], level[rows], seen(rows))
     distance = np.linalg.norm(shown[rows] - start[rows], axis=1)
     near = rows[distance < curriculum.min_distance]
     if near.size:
         choices = curriculum.drawable()
-        ways = _all_levels(predictor, curriculum, start[near], goal[near])[:, choices - 1]
+        every = _all_levels(predictor, curriculum, start[near], goal[near], seen(near))
+        ways = every[:, choices - 1]
         far = np.linalg.norm(ways - start[near, None], axis=2) >= curriculum.min_distance
         for row, way, mask in zip(near, ways, far, strict=True):
             # One draw among the far levels has the distribution of drawing until a level is far.
@@ -90,10 +99,14 @@ def draw_goals(
 
 
 def _all_levels(
-    predictor: GoalPredictor, curriculum: Curriculum, start: np.ndarray, goal: np.ndarray
+    predictor: GoalPredictor,
+    curriculum: Curriculum,
+    start: np.ndarray,
+    goal: np.ndarray,
+    contexts: np.ndarray | None,
 ) -> np.ndarray:
     """Return the imagined goals of every level, shape (n, n_levels, 3)."""
-    paths = predictor.paths(start, goal)
+    paths = predictor.paths(start, goal, contexts)
     if curriculum.levels == "time":
         return paths[:, 1:]
     return points_along(paths, np.arange(1, curriculum.n_levels + 1) / curriculum.n_levels)
@@ -122,7 +135,11 @@ def points_along(paths: np.ndarray, shares: np.ndarray) -> np.ndarray:
 
 
 def ahead(
-    predictor: GoalPredictor, start: np.ndarray, goal: np.ndarray, distance: float
+    predictor: GoalPredictor,
+    start: np.ndarray,
+    goal: np.ndarray,
+    distance: float,
+    contexts: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the first points of imagined paths that lie so far from their starts.
 
@@ -131,11 +148,12 @@ def ahead(
         start: object positions o_1, shape (n, 3), metres.
         goal: original goals g, shape (n, 3), metres.
         distance: metres.
+        contexts: as in `imagine`.
 
     Returns:
         points, shape (n, 3), metres; the end of a path that goes nowhere so far.
     """
-    paths = predictor.paths(start, goal)
+    paths = predictor.paths(start, goal, contexts)
     far = np.linalg.norm(paths - paths[:, :1], axis=2) >= distance
     first = np.where(far.any(axis=1), far.argmax(axis=1), paths.shape[1] - 1)
     points: np.ndarray = paths[np.arange(len(paths)), first]

@@ -27,6 +27,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
     step_seconds: float
     min_goal_distance: float
     original_goals: np.ndarray
+    contexts = np.zeros((0, 0, 0), dtype=np.float32)
     _far: np.ndarray
     rng: np.random.Generator
     table: EpisodeTable
@@ -74,6 +75,8 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
             self.infos[pos] = infos
         if self.imagined_ratio > 0.0:
             self.original_goals[pos] = [info["original_goal"] for info in infos]
+            if self.contexts.size:
+                self.contexts[pos] = [info["context"] for info in infos]
         self.pos = (pos + 1) % self.buffer_size
         self.full |= self.pos == 0
         self.n_added += 1

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import arm_and_wall
 import imageio.v3 as imageio
+import moving_wall
 import pytest
 
 from sb3_follow_object.any_task import derived as looking
@@ -36,6 +37,15 @@ def test_it_says_what_is_found(capsys: pytest.CaptureFixture[str]) -> None:
     assert facts["moves"].startswith("on its surface")
     assert facts["episodes"] == "50 steps; the object's 50"
     assert "where 60 episodes of ArmAndWall-v0 begin is recorded, once" in told.err
+
+
+def test_it_says_what_stands_elsewhere_and_what_of_it_is_seen(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["inspect", "--env", f"moving_wall:{moving_wall.WALL}"]) == 0
+    told = capsys.readouterr().out
+    expected = "wall (x, y): seen by nu and F_phi; paint, target: need not be seen"
+    assert any(line.split("  ", 1)[1].strip() == expected for line in told.splitlines())
 
 
 def test_it_draws_starts_and_goals(can_draw: None, tmp_path: Path) -> None:
