@@ -11,11 +11,11 @@ from gymnasium import spaces
 
 from ..common.answers import one_each, one_number
 from .goal_envs import SUCCESS_METHODS, missing_goal_keys
+from .goal_space import POSITIONS
 
 Judge = Callable[..., Any]
 GoalOf = Callable[[gym.Env, Any], tuple[Any, Any]]
 
-POSITION = 3
 _FAR = 10.0  # metres, farther than any goal is reached from
 
 
@@ -89,7 +89,7 @@ class RobotTask(gym.Wrapper):
             return obs
         goals = self._goal(self.env.unwrapped, obs)
         for name, value in zip(("achieved", "desired"), goals, strict=True):
-            if np.shape(value) != (POSITION,):
+            if np.shape(value) != (POSITIONS.size,):
                 raise ValueError(
                     f"goal= must return two positions of the shape (3,); the {name} one has the "
                     f"shape {np.shape(value)}"
@@ -203,7 +203,7 @@ def _answers_batches(judge: Judge, desired: np.ndarray) -> bool:
 def _goal_space(space: spaces.Space) -> spaces.Dict:
     """The space of observations with goals that are positions."""
     size = sum(part.size for part in _parts(space.sample()))
-    sizes = {"observation": size, "achieved_goal": POSITION, "desired_goal": POSITION}
+    sizes = {"observation": size, "achieved_goal": POSITIONS.size, "desired_goal": POSITIONS.size}
     return spaces.Dict(
         {key: spaces.Box(-np.inf, np.inf, (n,), np.float64) for key, n in sizes.items()}
     )

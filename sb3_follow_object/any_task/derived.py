@@ -14,10 +14,11 @@ from ..common.files import lock
 from ..common.numbers import checked_whole
 from ..common.reports import Report
 from ..envs.goal_envs import missing_goal_keys
+from ..envs.goal_space import followed_space
 from ..envs.physics_engine import mujoco
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
-from ..envs.robot_face import POSITION, RobotTask, rewards_on_and_off
+from ..envs.robot_face import RobotTask, rewards_on_and_off
 from .context import context_of
 from .finding import Candidate, Observed, candidates, find_effector, find_object, observe
 from .physics_access import physics_of
@@ -125,9 +126,7 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
             "is_success= what is achieved, what is desired and when that is reached"
         )
     horizon = _horizon(env)
-    shape = env.observation_space["desired_goal"].shape  # type: ignore[index]
-    if shape != (POSITION,):
-        raise ValueError(f"goals must be positions of the shape (3,), not {shape}")
+    followed_space(env.observation_space["desired_goal"].shape)  # type: ignore[index]
     few, model, data = record_resets(env, _FEW)
     on, off = rewards_on_and_off(env, few.goals[0])
     if (on, off) != (0.0, -1.0):

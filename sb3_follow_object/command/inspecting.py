@@ -14,6 +14,7 @@ from ..any_task.scene_picture import draw_points
 from ..any_task.simulation import DerivedObjectVecEnv
 from ..common.reports import Report
 from ..envs import IDS
+from ..envs.goal_space import goal_space
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
 from .pictures import write_png
@@ -61,7 +62,10 @@ def draw_found(env_id: str, out: Path) -> None:
     env = robot_maker(found.env_id)()
     try:
         env.reset(seed=0)
-        starts, goals = found.resets.starts[:_SHOWN], found.resets.goals[:_SHOWN]
+        starts, goals = (
+            goal_space(each.shape[1:]).point(each[:_SHOWN])
+            for each in (found.resets.starts, found.resets.goals)
+        )
         write_png(out, draw_points(env, starts, goals))
     finally:
         env.close()
@@ -78,8 +82,8 @@ def _object(found: Derived) -> str:
 
 def _goal(found: Derived) -> str:
     goals, starts = found.resets.goals, found.resets.starts
-    away = np.linalg.norm(goals - starts, axis=1)
-    up = goals[:, 2] - starts[:, 2]
+    space = goal_space(goals.shape[1:])
+    away, up = space.distance(goals, starts), space.height(goals) - space.height(starts)
     return (
         f"{away.min():.2f} to {away.max():.2f} m from the start, "
         f"{up.min():.2f} to {up.max():.2f} m above it"

@@ -105,7 +105,8 @@ def draw_imagined(
                 env.unwrapped.set_markers(way)  # type: ignore[attr-defined]
                 panels.append(frame(env))
             else:
-                panels.append(draw_points(env, way, obs["desired_goal"][None]))
+                goal = predictor.space.point(obs["desired_goal"][None])
+                panels.append(draw_points(env, way, goal))
         write_png(out, np.concatenate(panels, axis=1))
     finally:
         env.close()
@@ -114,7 +115,7 @@ def draw_imagined(
 def imagined_way(
     predictor: GoalPredictor, obs: dict[str, np.ndarray], context: np.ndarray
 ) -> np.ndarray:
-    """Imagined goals (25, 3), evenly along the way from where an episode begins to its goal.
+    """Where imagined goals are (25, 3), evenly along the way from an episode's start to its goal.
 
     Args:
         predictor: F_phi.
@@ -123,8 +124,8 @@ def imagined_way(
     """
     start, goal = obs["achieved_goal"][None], obs["desired_goal"][None]
     paths = predictor.paths(start, goal, context[None])
-    way: np.ndarray = points_along(paths, np.arange(1, _LEVELS + 1) / _LEVELS)[0]
-    return way
+    shares = np.arange(1, _LEVELS + 1) / _LEVELS
+    return predictor.space.point(points_along(paths, shares, predictor.space)[0])
 
 
 def record(

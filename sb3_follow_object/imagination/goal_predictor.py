@@ -16,11 +16,11 @@ from ..common.copies import WholeCopies
 from ..common.files import atomic_write
 from ..common.numbers import checked_whole
 from ..common.torch_helpers import one_thread_after_forks, usable_device, usual_defaults
+from ..envs.goal_space import KINDS, POSITIONS, GoalSpace
 from ..settings.learning import PredictorSettings
 from .predictor_files import (
     FACTS_FILE,
     FORMAT,
-    POSITION,
     SCALES,
     TENSORS_FILE,
     checked_facts,
@@ -54,12 +54,14 @@ class GoalPredictor(WholeCopies):
         env_id: gymnasium id of the task that it was made for.
         physics: short hash of the physics that it was made for.
         object_on_table: whether the object was kept on the table; None where that is not known.
+        space: of its positions and goals.
         context: names of the numbers that it sees beside start and goal, of places of other things
             (`any_task.context`).
         error_mm: mean distance to the held-out paths for each k in 1..T, shape (T,), millimetres.
         device: that it imagines on, the CPU unless `to` says another.
     """
 
+    space: GoalSpace = POSITIONS
     context: tuple[str, ...] = ()
 
     def __init__(
@@ -73,6 +75,7 @@ class GoalPredictor(WholeCopies):
         error_mm: np.ndarray,
         object_on_table: bool | None = None,
         context: Sequence[str] = (),
+        space: GoalSpace = POSITIONS,
     ) -> None:
         self.hidden = tuple(hidden)
         self.horizon = horizon
@@ -80,11 +83,13 @@ class GoalPredictor(WholeCopies):
         self.physics = physics
         self.object_on_table = object_on_table
         self.context = tuple(context)
+        self.space = space
         self.error_mm = error_mm
         self.device = torch.device("cpu")
         self._tensors = tensors
         with usual_defaults():
-            self._network = make_network(n_inputs(self.context), self.hidden)
+            inputs = n_inputs(space, self.context)
+            self._network = make_network(inputs, self.hidden, space.n_encoded)
         self._network.load_state_dict(
             {name: value for name, value in tensors.items() if name not in SCALES}
         )
@@ -141,7 +146,7 @@ class GoalPredictor(WholeCopies):
         Raises:
             ValueError: an argument has a wrong shape or range, or holds NaN or infinity.
         """
-        paths, goals = checked_paths(paths, goals)
+        paths, goals, space = checked_paths(paths, goals)
         contexts = checked_contexts(contexts, len(paths), context)
         settings = PredictorSettings(
             hidden=hidden,
@@ -158,14 +163,14 @@ class GoalPredictor(WholeCopies):
         order = torch.randperm(n, generator=generator).numpy()
         test, train = order[:n_test], order[n_test:]
 
-        inputs, targets = make_samples(paths[train], goals[train], contexts[train])
+        inputs, targets = make_samples(paths[train], goals[train], contexts[train], space)
         tensors = {
             "input_mean": torch.from_numpy(inputs.mean(axis=0)),
             "input_std": torch.from_numpy(np.maximum(inputs.std(axis=0), SMALLEST_STD)),
             "output_mean": torch.from_numpy(targets.mean(axis=0)),
             "output_std": torch.from_numpy(np.maximum(targets.std(axis=0), SMALLEST_STD)),
         }
-        network = make_network(n_inputs(context), settings.hidden)
+        network = make_network(n_inputs(space, context), settings.hidden, space.n_encoded)
         initialise(network, generator)
         x = (torch.from_numpy(inputs) - tensors["input_mean"]) / tensors["input_std"]
         y = (torch.from_numpy(targets) - tensors["output_mean"]) / tensors["output_std"]
@@ -189,10 +194,11 @@ class GoalPredictor(WholeCopies):
             physics=physics,
             object_on_table=object_on_table,
             context=context,
+            space=space,
             error_mm=np.full(horizon, np.nan),
         )
         imagined = predictor.paths(paths[test, 0], goals[test], contexts[test])
-        distance = np.linalg.norm(imagined[:, 1:] - paths[test, 1:], axis=2)
+        distance = space.distance(imagined[:, 1:], paths[test, 1:])
         predictor.error_mm = 1000.0 * distance.mean(axis=0)
         return predictor
 
@@ -226,14 +232,15 @@ class GoalPredictor(WholeCopies):
         """
         start, goal, k = (np.asarray(values) for values in (start, goal, k))
         n = len(k) if k.ndim == 1 else -1
-        if start.shape != (n, POSITION) or goal.shape != (n, POSITION):
+        space, size = self.space, self.space.size
+        if start.shape != (n, size) or goal.shape != (n, size):
             raise ValueError(
-                f"start, goal and k must have the shapes (n, 3), (n, 3) and (n,), "
+                f"start, goal and k must have the shapes (n, {size}), (n, {size}) and (n,), "
                 f"got {start.shape}, {goal.shape} and {k.shape}."
             )
         contexts = checked_contexts(contexts, n, self.context)
         if n == 0:
-            return np.zeros((0, POSITION))
+            return np.zeros((0, size))
         for name, values in (("start", start), ("goal", goal), ("k", k)):
             if not (np.issubdtype(values.dtype, np.number) and np.isfinite(values).all()):
                 raise ValueError(f"{name} must hold finite numbers, got others in it.")
@@ -243,14 +250,15 @@ class GoalPredictor(WholeCopies):
             )
         if (k != np.round(k)).any():
             raise ValueError(f"k must hold whole numbers, got {k[k != np.round(k)][0]} in it.")
-        inputs = np.concatenate([start, goal, contexts, k[:, None]], axis=1, dtype=np.float64)
+        parts = space.encode(start), space.encode(goal), contexts, k[:, None]
+        inputs = np.concatenate(parts, axis=1, dtype=np.float64)
         with np.errstate(under="ignore"):
             scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
             scaled = scaled.astype(np.float32)
         with torch.inference_mode():
             on = torch.from_numpy(scaled).to(self.device)
             outputs = self._network(on).cpu().numpy()
-        return outputs * self._scales["output_std"] + self._scales["output_mean"]
+        return space.decode(outputs * self._scales["output_std"] + self._scales["output_mean"])
 
     def paths(
         self, start: np.ndarray, goal: np.ndarray, contexts: np.ndarray | None = None
@@ -272,7 +280,8 @@ class GoalPredictor(WholeCopies):
             np.tile(np.arange(1, self.horizon + 1), len(start)),
             *([] if contexts is None else [np.repeat(contexts, self.horizon, axis=0)]),
         )
-        return np.concatenate([start[:, None], ahead.reshape(-1, self.horizon, POSITION)], axis=1)
+        ahead = ahead.reshape(-1, self.horizon, self.space.size)
+        return np.concatenate([start[:, None], ahead], axis=1)
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write ``predictor.safetensors`` and ``predictor.json`` into ``folder``.
@@ -288,6 +297,7 @@ class GoalPredictor(WholeCopies):
             "env_id": self.env_id,
             "physics": self.physics,
             "object_on_table": self.object_on_table,
+            **({"goals": self.space.kind} if self.space.kind != POSITIONS.kind else {}),
             **({"context": list(self.context)} if self.context else {}),
             "horizon": self.horizon,
             "hidden": list(self.hidden),
@@ -333,8 +343,10 @@ class GoalPredictor(WholeCopies):
                 f"The predictor in {folder} was made with object_on_table={made}, "
                 f"not {object_on_table}: fit one with that setting."
             )
-        context = facts.get("context", [])
-        tensors = checked_tensors(folder / TENSORS_FILE, facts["hidden"], context, facts["sha256"])
+        space, context = KINDS[facts.get("goals", POSITIONS.kind)], facts.get("context", [])
+        tensors = checked_tensors(
+            folder / TENSORS_FILE, space, facts["hidden"], context, facts["sha256"]
+        )
         return cls(
             tensors,
             hidden=facts["hidden"],
@@ -343,5 +355,6 @@ class GoalPredictor(WholeCopies):
             physics=facts["physics"],
             object_on_table=made,
             context=context,
+            space=space,
             error_mm=np.array(facts["error_mm"], dtype=np.float64),
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.answers import check_shape
+from ..envs.goal_space import POSITIONS, GoalSpace
 from .curriculum import Curriculum
 from .goal_predictor import GoalPredictor
 
@@ -83,13 +84,13 @@ def draw_goals(
         return None if contexts is None else contexts[rows]
 
     shown[rows] = imagine(predictor, curriculum, start[rows], goal[rows], level[rows], seen(rows))
-    distance = np.linalg.norm(shown[rows] - start[rows], axis=1)
-    near = rows[distance < curriculum.min_distance]
+    distance = predictor.space.distance
+    near = rows[distance(shown[rows], start[rows]) < curriculum.min_distance]
     if near.size:
         choices = curriculum.drawable()
         every = _all_levels(predictor, curriculum, start[near], goal[near], seen(near))
         ways = every[:, choices - 1]
-        far = np.linalg.norm(ways - start[near, None], axis=2) >= curriculum.min_distance
+        far = distance(ways, start[near, None]) >= curriculum.min_distance
         for row, way, mask in zip(near, ways, far, strict=True):
             # One draw among the far levels has the distribution of drawing until a level is far.
             choice = rng.choice(np.flatnonzero(mask)) if mask.any() else None
@@ -109,20 +110,22 @@ def _all_levels(
     paths = predictor.paths(start, goal, contexts)
     if curriculum.levels == "time":
         return paths[:, 1:]
-    return points_along(paths, np.arange(1, curriculum.n_levels + 1) / curriculum.n_levels)
+    shares = np.arange(1, curriculum.n_levels + 1) / curriculum.n_levels
+    return points_along(paths, shares, predictor.space)
 
 
-def points_along(paths: np.ndarray, shares: np.ndarray) -> np.ndarray:
+def points_along(paths: np.ndarray, shares: np.ndarray, space: GoalSpace = POSITIONS) -> np.ndarray:
     """Interpolate paths at shares of their length.
 
     Args:
         paths: shape (n, m, 3), m >= 2, metres.
         shares: shape (s,), in [0, 1].
+        space: of the paths.
 
     Returns:
         points, shape (n, s, 3); share 1 is the path's end.
     """
-    steps = np.linalg.norm(np.diff(paths, axis=1), axis=2)
+    steps = space.distance(paths[:, 1:], paths[:, :-1])
     travelled = np.concatenate([np.zeros((len(paths), 1)), np.cumsum(steps, axis=1)], axis=1)
     wanted = travelled[:, -1:] * shares  # (n, s)
     # Index of the step in which the wanted length is reached.
@@ -130,8 +133,8 @@ def points_along(paths: np.ndarray, shares: np.ndarray) -> np.ndarray:
     row = np.arange(len(paths))[:, None]
     # A path of length zero stays where it is: nothing to divide.
     length = np.maximum(steps[row, step], np.finfo(np.float64).tiny)
-    part = np.clip((wanted - travelled[row, step]) / length, 0.0, 1.0)[..., None]
-    return (1.0 - part) * paths[row, step] + part * paths[row, step + 1]
+    part = np.clip((wanted - travelled[row, step]) / length, 0.0, 1.0)
+    return space.between(paths[row, step], paths[row, step + 1], part)
 
 
 def ahead(
@@ -154,7 +157,7 @@ def ahead(
         points, shape (n, 3), metres; the end of a path that goes nowhere so far.
     """
     paths = predictor.paths(start, goal, contexts)
-    far = np.linalg.norm(paths - paths[:, :1], axis=2) >= distance
+    far = predictor.space.distance(paths, paths[:, :1]) >= distance
     first = np.where(far.any(axis=1), far.argmax(axis=1), paths.shape[1] - 1)
     points: np.ndarray = paths[np.arange(len(paths)), first]
     return points

@@ -14,9 +14,8 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError
 
+from ..envs.goal_space import KINDS, POSITIONS, GoalSpace
 from ..settings.kinds import LAYERS_LIMIT, WIDTH_LIMIT
-
-POSITION = 3  # coordinates of an object position
 
 TENSORS_FILE = "predictor.safetensors"
 FACTS_FILE = "predictor.json"
@@ -28,9 +27,9 @@ CONTEXT_LIMIT = 1000  # numbers of a context
 SCALES = ("input_mean", "input_std", "output_mean", "output_std")  # tensors that are not weights
 
 
-def n_inputs(context: Sequence[str]) -> int:
+def n_inputs(goals: GoalSpace, context: Sequence[str]) -> int:
     """Return how many numbers F_phi sees: o_1, g, those of the context, k."""
-    return 2 * POSITION + len(context) + 1
+    return 2 * goals.n_encoded + len(context) + 1
 
 
 def valid_hidden(hidden: Any) -> bool:
@@ -63,6 +62,8 @@ def checked_facts(path: Path) -> dict[str, Any]:
     horizon, errors = facts.get("horizon"), facts.get("error_mm")
     if type(horizon) is not int or not 1 <= horizon <= HORIZON_LIMIT:
         raise ValueError(f"{damaged}: horizon must lie in 1..{HORIZON_LIMIT}, got {horizon!r}.")
+    if facts.get("goals", POSITIONS.kind) not in KINDS:
+        raise ValueError(f"{damaged}: goals must be of one of the kinds {list(KINDS)}.")
     context = facts.get("context", [])  # only where there is one
     if (
         not isinstance(context, list)
@@ -82,12 +83,13 @@ def checked_facts(path: Path) -> dict[str, Any]:
 
 
 def checked_tensors(
-    path: Path, hidden: Sequence[int], context: Sequence[str], sha256: str
+    path: Path, goals: GoalSpace, hidden: Sequence[int], context: Sequence[str], sha256: str
 ) -> dict[str, torch.Tensor]:
     """Return a predictor's weights, float32, and scales, float64, by their names.
 
     Args:
         path: of the safetensors file.
+        goals: what they are.
         hidden: widths of the hidden layers.
         context: names of its numbers.
         sha256: digest of the file's bytes.
@@ -95,12 +97,11 @@ def checked_tensors(
     Raises:
         ValueError: it is missing, oversized or another file, or holds what no predictor does.
     """
-    inputs = n_inputs(context)
+    inputs, outputs = n_inputs(goals, context), goals.n_encoded
     expected: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-        name: ((inputs if name.startswith("input") else POSITION,), torch.float64)
-        for name in SCALES
+        name: ((inputs if name.startswith("input") else outputs,), torch.float64) for name in SCALES
     }
-    for layer, (n_in, n_out) in enumerate(pairwise([inputs, *hidden, POSITION])):
+    for layer, (n_in, n_out) in enumerate(pairwise([inputs, *hidden, outputs])):
         # A ReLU stands between two linear layers, so these have the even places.
         expected[f"{2 * layer}.weight"] = ((n_out, n_in), torch.float32)
         expected[f"{2 * layer}.bias"] = ((n_out,), torch.float32)

@@ -9,18 +9,18 @@ import numpy as np
 import torch
 from torch import nn
 
-from .predictor_files import POSITION
+from ..envs.goal_space import KINDS, GoalSpace, goal_space
 
 Progress = Callable[[int, float], None]
 
 
-def make_network(inputs: int, hidden: Sequence[int]) -> nn.Sequential:
+def make_network(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     """Return the network with its weights unset: setting them here would use the global RNG."""
     widths = [inputs, *hidden]
     layers: list[nn.Module] = []
     for n_in, n_out in pairwise(widths):
         layers += [nn.utils.skip_init(nn.Linear, n_in, n_out), nn.ReLU()]
-    layers.append(nn.utils.skip_init(nn.Linear, widths[-1], POSITION))
+    layers.append(nn.utils.skip_init(nn.Linear, widths[-1], outputs))
     return nn.Sequential(*layers)
 
 
@@ -34,13 +34,14 @@ def initialise(network: nn.Sequential, generator: torch.Generator) -> None:
 
 
 def make_samples(
-    paths: np.ndarray, goals: np.ndarray, contexts: np.ndarray
+    paths: np.ndarray, goals: np.ndarray, contexts: np.ndarray, space: GoalSpace
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs (n * T, 7 + c) and targets (n * T, 3) for every path and every k in 1..T."""
+    """Return inputs and targets, a row for every path and every k in 1..T."""
     n, horizon = len(paths), paths.shape[1] - 1
-    fixed = np.repeat(np.concatenate([paths[:, 0], goals, contexts], axis=1), horizon, axis=0)
+    start, goals, ahead = (space.encode(each) for each in (paths[:, 0], goals, paths[:, 1:]))
+    fixed = np.repeat(np.concatenate([start, goals, contexts], axis=1), horizon, axis=0)
     k = np.tile(np.arange(1.0, horizon + 1), n)[:, None]
-    return np.concatenate([fixed, k], axis=1), paths[:, 1:].reshape(-1, POSITION)
+    return np.concatenate([fixed, k], axis=1), ahead.reshape(n * horizon, -1)
 
 
 def train_network(
@@ -71,18 +72,21 @@ def train_network(
             progress(epoch, float(total) / len(inputs))
 
 
-def checked_paths(paths: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return paths (n, T+1, 3) and goals (n, 3), finite float64."""
+def checked_paths(paths: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray, GoalSpace]:
+    """Return paths (n, T+1, 3) and goals (n, 3), finite float64, and the space that they lie in."""
     paths, goals = np.asarray(paths, dtype=np.float64), np.asarray(goals, dtype=np.float64)
-    if paths.ndim != 3 or len(paths) < 2 or paths.shape[1] < 2 or paths.shape[2] != POSITION:
+    space = goal_space(paths.shape[2:] or (0,))
+    if paths.ndim != 3 or len(paths) < 2 or paths.shape[1] < 2 or space.kind not in KINDS:
         raise ValueError(
             f"paths must have the shape (n, T+1, 3) with n >= 2 and T >= 1, got {paths.shape}."
         )
-    if goals.shape != (len(paths), POSITION):
-        raise ValueError(f"goals must have the shape ({len(paths)}, 3), got {goals.shape}.")
+    if goals.shape != (len(paths), space.size):
+        raise ValueError(
+            f"goals must have the shape ({len(paths)}, {space.size}), got {goals.shape}."
+        )
     if not (np.isfinite(paths).all() and np.isfinite(goals).all()):
         raise ValueError("paths and goals must be finite, got NaN or infinity in them.")
-    return paths, goals
+    return paths, goals, space
 
 
 def checked_contexts(contexts: np.ndarray | None, n: int, names: Sequence[str]) -> np.ndarray:

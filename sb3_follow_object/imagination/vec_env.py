@@ -31,7 +31,6 @@ from .goal_env import (
 )
 from .goal_predictor import GoalPredictor
 from .imagined_goals import ahead, draw_goals, imagine
-from .predictor_files import POSITION
 
 let_vec_envs_be_copied()
 
@@ -68,17 +67,17 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
         if mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {mode!r}.")
         super().__init__(venv)
-        self._dtype = checked_goals(venv.observation_space, venv.has_attr)
+        self._space, self._dtype = checked_goals(venv.observation_space, venv.has_attr)
         check_horizons(predictor, curriculum)
         self._success_method = success_method(venv.has_attr)
         self.predictor = predictor
         self.curriculum = curriculum
         self.mode = mode
         self._rng = np.random.default_rng()
-        self._shown = np.zeros((venv.num_envs, POSITION), self._dtype)
+        self._shown = np.zeros((venv.num_envs, self._space.size), self._dtype)
         self._original = self._shown.copy()
         self._level = np.zeros(venv.num_envs, dtype=np.int64)
-        self._start = np.zeros((venv.num_envs, POSITION))
+        self._start = np.zeros((venv.num_envs, self._space.size))
         self._contexts = np.zeros((venv.num_envs, len(predictor.context)))
         _read_contexts(venv, [], predictor.context)  # refused now rather than at the first reset
 
@@ -108,7 +107,7 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
         for i in ended:
             last = terminal_observation(infos[i])
             for array, key in ((achieved, "achieved_goal"), (goals, "desired_goal")):
-                check_shape(last[key], (POSITION,), f"the terminal observation {key!r}")
+                check_shape(last[key], (self._space.size,), f"the terminal observation {key!r}")
                 array[i] = last[key]
         check_goal_stays(goals, self._original)
 

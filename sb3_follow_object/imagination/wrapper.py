@@ -30,7 +30,6 @@ from .goal_env import (
 )
 from .goal_predictor import GoalPredictor
 from .imagined_goals import ahead, draw_goals, imagine
-from .predictor_files import POSITION
 
 AUTO = "auto"  # the predictor that is kept for the environment's task, learned where it is not
 
@@ -74,7 +73,7 @@ class ImaginedGoalWrapper(
         curriculum: Curriculum | Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(env)
-        self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)
+        self._space, self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)
         self._compute_reward = env.get_wrapper_attr("compute_reward")
         self._is_success = env.get_wrapper_attr(success_method(env.has_wrapper_attr))
         self.active = isinstance(curriculum, Curriculum)
@@ -86,9 +85,9 @@ class ImaginedGoalWrapper(
         if isinstance(predictor, GoalPredictor):
             check_horizons(predictor, self.curriculum)
         self._rng = np.random.default_rng()
-        self._shown = self._original = np.zeros(POSITION, self._dtype)
+        self._shown = self._original = np.zeros(self._space.size, self._dtype)
         self._level = 0
-        self._start = np.zeros(POSITION)
+        self._start = np.zeros(self._space.size)
         self._context = np.zeros(0)  # where other things stand that F_phi sees
 
     @property
@@ -107,7 +106,7 @@ class ImaginedGoalWrapper(
             self._rng = np.random.default_rng([seed, STREAM])
         obs, info = self.env.reset(seed=seed, options=options)
         for key in ("achieved_goal", "desired_goal"):
-            check_shape(obs[key], (POSITION,), f"the observation {key!r}")
+            check_shape(obs[key], (self._space.size,), f"the observation {key!r}")
         self._original = obs["desired_goal"].copy()
         self._shown, self._level = self._original, 0
         self._start = np.array(obs["achieved_goal"], dtype=np.float64)

@@ -12,6 +12,7 @@ import gymnasium as gym
 import moving_wall
 import numpy as np
 import pytest
+from small_buffers import fill
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_follow_object.envs.robot_copies import ProcessVecEnv, robot_maker
@@ -223,16 +224,7 @@ def test_imagined_goals_of_replay_lie_on_the_way_past_the_wall(predictor: GoalPr
     buffer = FollowObjectReplayBuffer(
         1000, env.observation_space, env.action_space, env, n_envs=N, imagined_ratio=1.0, seed=0
     )
-    obs: Any = env.reset()
-    for _ in range(T):
-        actions = np.zeros((N, 3), np.float32)
-        after, rewards, dones, infos = env.step(actions)
-        last = {key: value.copy() for key, value in after.items()}  # type: ignore[union-attr]
-        for i in np.flatnonzero(dones):
-            for key in last:
-                last[key][i] = infos[i]["terminal_observation"][key]
-        buffer.add(obs, last, actions, rewards, dones, infos)
-        obs = after
+    fill([buffer], env, T)
     start = buffer.observations["achieved_goal"][0]
     ways = predictor.paths(start, buffer.original_goals[0], buffer.contexts[0]).reshape(-1, 3)
     goals = buffer.sample(64).observations["desired_goal"].numpy()
