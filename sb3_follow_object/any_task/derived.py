@@ -32,6 +32,7 @@ _LONG, _LONG_T = 100, 50  # episodes of more steps than this have an object whos
 _FILE = "resets.safetensors"
 _FARTHEST = 0.5  # metres at which no goal is reached any more
 _HALVINGS = 16
+_TRIED = 201  # positions of a drawer or a door, to find the one at the goal
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +138,7 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
     seen = observe(env)
     wanted = _named_object(env)
     found = find_object(seen, wanted)
-    if ends_at_goal(env, found.body):
+    if ends_at_goal(env, found):
         raise ValueError(
             "it ends its episodes at the goal; imagined goals need episodes that go on to their "
             "time limit: turn that off in the environment"
@@ -192,15 +193,27 @@ def success_distance(env: gym.Env, goals: np.ndarray) -> float:
     return nearest
 
 
-def ends_at_goal(env: gym.Env, body: int) -> bool:
-    """Whether an episode is terminated once an object with a free joint is put on its goal."""
+def ends_at_goal(env: gym.Env, found: Candidate) -> bool:
+    """Whether an episode is terminated once the object is put on its goal, as near as it can be."""
     obs, _ = env.reset(seed=0)
     model, data = physics_of(env)
-    joint = int(model.body_jntadr[body])
-    if int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_FREE):
-        return False
+    goal = np.array(obs["desired_goal"], np.float64)
+    joint = int(model.body_jntadr[found.body])
     place = int(model.jnt_qposadr[joint])
-    data.qpos[place : place + 3] += obs["desired_goal"] - obs["achieved_goal"]
+    if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):
+        data.qpos[place : place + 3] += goal - obs["achieved_goal"]
+    else:
+        low, high = data.qpos[place] + np.array([-_FARTHEST, _FARTHEST])
+        if model.jnt_limited[joint]:
+            low, high = model.jnt_range[joint]
+
+        def off(position: float) -> float:
+            data.qpos[place] = position
+            mujoco.mj_kinematics(model, data)
+            frame = data.xmat[found.body].reshape(3, 3)
+            return float(np.linalg.norm(data.xpos[found.body] + frame @ found.offset - goal))
+
+        data.qpos[place] = min(np.linspace(low, high, _TRIED), key=off)
     mujoco.mj_forward(model, data)
     return bool(env.step(np.zeros_like(env.action_space.sample()))[2])
 
