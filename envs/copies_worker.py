@@ -58,6 +58,10 @@ class Copies:
         """Call a method of one."""
         return self.envs[index].get_wrapper_attr(name)(*args, **kwargs)
 
+    def apply(self, index: int, function: Callable[[gym.Env], Any]) -> Any:
+        """Call a function of one."""
+        return function(self.envs[index])
+
     def attribute(self, index: int, name: str) -> Any:
         """Read an attribute of one."""
         return self.envs[index].get_wrapper_attr(name)

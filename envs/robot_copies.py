@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from multiprocessing.connection import Connection
 from socket import socketpair
@@ -185,6 +185,10 @@ class ProcessVecEnv(VecEnv):
             judge = self._judge.get_wrapper_attr(method_name)
             return [judge(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
         return self._each(indices, "method", method_name, method_args, method_kwargs)
+
+    def apply(self, function: Callable[[gym.Env], Any], rows: Iterable[int]) -> list[Any]:
+        """Return what a function says of copies, each in the process that it runs in."""
+        return self._each(rows, "apply", function)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
         """Whether copies have a wrapper of this class."""

@@ -11,12 +11,12 @@ from gymnasium import spaces
 
 from ..common.answers import one_each, one_number
 from .goal_envs import SUCCESS_METHODS, missing_goal_keys
+from .goal_space import POSITIONS
 
 Judge = Callable[..., Any]
 GoalOf = Callable[[gym.Env, Any], tuple[Any, Any]]
 EffectorOf = Callable[[gym.Env], Any]
 
-POSITION = 3
 _FAR = 10.0  # metres, farther than any goal is reached from
 
 
@@ -73,7 +73,7 @@ class RobotTask(gym.Wrapper):
             )
         if effector is not None:
             self.observation_space = _with_effector(self.observation_space)
-            n = self.observation_space["observation"].shape[0]
+            (n,) = cast(spaces.Box, self.observation_space["observation"]).shape
             self.told_effector = n - 3, n - 2, n - 1
 
     def reset(
@@ -100,7 +100,7 @@ class RobotTask(gym.Wrapper):
         if self._effector is None:
             return shown
         place = np.array(self._effector(self.env.unwrapped), dtype=np.float64)
-        if place.shape != (POSITION,):
+        if place.shape != (POSITIONS.size,):
             raise ValueError(
                 f"effector= must return a position of the shape (3,), not {place.shape}"
             )
@@ -110,7 +110,7 @@ class RobotTask(gym.Wrapper):
     def _with_goals(self, obs: Any, goal: GoalOf) -> dict[str, np.ndarray]:
         goals = goal(self.env.unwrapped, obs)
         for name, value in zip(("achieved", "desired"), goals, strict=True):
-            if np.shape(value) != (POSITION,):
+            if np.shape(value) != (POSITIONS.size,):
                 raise ValueError(
                     f"goal= must return two positions of the shape (3,); the {name} one has the "
                     f"shape {np.shape(value)}"
@@ -224,7 +224,7 @@ def _answers_batches(judge: Judge, desired: np.ndarray) -> bool:
 def _goal_space(space: spaces.Space) -> spaces.Dict:
     """The space of observations with goals that are positions."""
     size = sum(part.size for part in _parts(space.sample()))
-    sizes = {"observation": size, "achieved_goal": POSITION, "desired_goal": POSITION}
+    sizes = {"observation": size, "achieved_goal": POSITIONS.size, "desired_goal": POSITIONS.size}
     return spaces.Dict(
         {key: spaces.Box(-np.inf, np.inf, (n,), np.float64) for key, n in sizes.items()}
     )
@@ -234,7 +234,7 @@ def _with_effector(space: spaces.Space) -> spaces.Dict:
     """The space of observations that end with a position."""
     keys = dict(cast(spaces.Dict, space).spaces)
     box = cast(spaces.Box, keys["observation"])
-    anywhere = np.full(POSITION, np.inf)
+    anywhere = np.full(POSITIONS.size, np.inf)
     low, high = np.append(box.low, -anywhere), np.append(box.high, anywhere)
     kind: Any = box.dtype
     return spaces.Dict({**keys, "observation": spaces.Box(low, high, dtype=kind)})

@@ -14,13 +14,16 @@ from ..common.files import lock
 from ..common.numbers import checked_whole
 from ..common.reports import Report
 from ..envs.goal_envs import missing_goal_keys
+from ..envs.goal_space import followed_space
 from ..envs.physics_engine import mujoco
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
-from ..envs.robot_face import POSITION, RobotTask, rewards_on_and_off
+from ..envs.robot_face import RobotTask, rewards_on_and_off
+from .context import context_of
 from .finding import Candidate, Effector, Observed, candidates, find_effector, find_object, observe
 from .physics_access import physics_of
 from .resets import Resets, record_resets, varying_bodies
+from .robot_parts import body_name
 from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of
 
 N_RESETS = 2000  # episodes that are recorded; of a hundred F_phi does not learn the places between
@@ -29,6 +32,7 @@ _LONG, _LONG_T = 100, 50  # episodes of more steps than this have an object whos
 _FILE = "resets.safetensors"
 _FARTHEST = 0.5  # metres at which no goal is reached any more
 _HALVINGS = 16
+_TRIED = 201  # positions of a drawer or a door, to find the one at the goal
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +47,7 @@ class Derived:
         horizon: T of the robot's episodes.
         success_distance: metres within which a goal is reached in every direction.
         varying: names of what stands elsewhere in each episode.
+        context: numbers of places, of these or of what can move, that nu and F_phi see.
         shifted: whether rewards of 1 and 0 are shown as 0 and -1.
         physics: hash of what decides how the object moves and where goals lie.
         resets: recorded.
@@ -56,6 +61,7 @@ class Derived:
     horizon: int
     success_distance: float
     varying: tuple[str, ...]
+    context: tuple[str, ...]
     shifted: bool
     physics: str
     resets: Resets
@@ -121,9 +127,7 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
             "is_success= what is achieved, what is desired and when that is reached"
         )
     horizon = _horizon(env)
-    shape = env.observation_space["desired_goal"].shape  # type: ignore[index]
-    if shape != (POSITION,):
-        raise ValueError(f"goals must be positions of the shape (3,), not {shape}")
+    followed_space(env.observation_space["desired_goal"].shape)  # type: ignore[index]
     few, model, data = record_resets(env, _FEW)
     on, off = rewards_on_and_off(env, few.goals[0])
     if (on, off) != (0.0, -1.0):
@@ -134,7 +138,7 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
     seen = observe(env)
     wanted = _named_object(env)
     found = find_object(seen, wanted)
-    if ends_at_goal(env, found.body):
+    if ends_at_goal(env, found):
         raise ValueError(
             "it ends its episodes at the goal; imagined goals need episodes that go on to their "
             "time limit: turn that off in the environment"
@@ -144,6 +148,7 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
     physics = physics_digest_of(model, found.body, found.offset, few, drawn)
     resets = _kept_resets(env_id, env, physics, report)
     task = DerivedTask(env_id, object_horizon(horizon), physics)
+    context = context_of(model, resets, found.body)
     return Derived(
         env_id,
         found,
@@ -151,11 +156,12 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
         find_effector(seen, told_effector(env)),
         horizon,
         within,
-        tuple(str(model.body(body).name) for body in sorted(varying_bodies(model, resets))),
+        tuple(body_name(model, body) for body in sorted(varying_bodies(model, resets))),
+        context,
         bool(isinstance(env, RobotTask) and env.shifted),
         physics,
         resets,
-        object_scene_of(model, data, found.body, found.offset, resets, task, within),
+        object_scene_of(model, data, found.body, found.offset, resets, task, within, context),
     )
 
 
@@ -187,15 +193,27 @@ def success_distance(env: gym.Env, goals: np.ndarray) -> float:
     return nearest
 
 
-def ends_at_goal(env: gym.Env, body: int) -> bool:
-    """Whether an episode is terminated once an object with a free joint is put on its goal."""
+def ends_at_goal(env: gym.Env, found: Candidate) -> bool:
+    """Whether an episode is terminated once the object is put on its goal, as near as it can be."""
     obs, _ = env.reset(seed=0)
     model, data = physics_of(env)
-    joint = int(model.body_jntadr[body])
-    if int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_FREE):
-        return False
+    goal = np.array(obs["desired_goal"], np.float64)
+    joint = int(model.body_jntadr[found.body])
     place = int(model.jnt_qposadr[joint])
-    data.qpos[place : place + 3] += obs["desired_goal"] - obs["achieved_goal"]
+    if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):
+        data.qpos[place : place + 3] += goal - obs["achieved_goal"]
+    else:
+        low, high = data.qpos[place] + np.array([-_FARTHEST, _FARTHEST])
+        if model.jnt_limited[joint]:
+            low, high = model.jnt_range[joint]
+
+        def off(position: float) -> float:
+            data.qpos[place] = position
+            mujoco.mj_kinematics(model, data)
+            frame = data.xmat[found.body].reshape(3, 3)
+            return float(np.linalg.norm(data.xpos[found.body] + frame @ found.offset - goal))
+
+        data.qpos[place] = min(np.linspace(low, high, _TRIED), key=off)
     mujoco.mj_forward(model, data)
     return bool(env.step(np.zeros_like(env.action_space.sample()))[2])
 

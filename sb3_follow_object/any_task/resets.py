@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from ..common.array_trees import load_tree, save_tree
+from ..envs.goal_space import goal_space
 from ..envs.physics_engine import mujoco
 from .physics_access import physics_of
 from .robot_parts import robot_bodies, standing
@@ -42,7 +43,8 @@ class Resets:
 
     def on_surface(self) -> bool:
         """Whether nearly all goals lie as high as the object starts, so that it can be pushed."""
-        off = np.abs(self.goals[:, 2] - self.starts[:, 2])
+        space = goal_space(self.goals.shape[1:])
+        off = np.abs(space.height(self.goals) - space.height(self.starts))
         return bool((off < SURFACE_HEIGHT).mean() >= SURFACE_SHARE)
 
     def save(self, path: Path) -> None:

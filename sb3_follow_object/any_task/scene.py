@@ -54,6 +54,7 @@ class DerivedScene:
         goals: (n, 3) metres.
         substeps: of the physics in an env step of 0.04 s.
         success_distance: metres within which a goal is reached.
+        context: what episodes differ in beside start and goal, by the names of `context_of`.
     """
 
     task: DerivedTask
@@ -65,6 +66,7 @@ class DerivedScene:
     goals: np.ndarray
     substeps: int
     success_distance: float
+    context: tuple[str, ...] = ()
     alone: bool = True
     time: float = 0.0
 
@@ -80,6 +82,7 @@ def object_scene_of(
     resets: Resets,
     task: DerivedTask,
     success_distance: float,
+    context: tuple[str, ...] = (),
 ) -> DerivedScene:
     """Make the scene in which a body moves by itself, pulled by a mocap body (section 4.1).
 
@@ -91,6 +94,7 @@ def object_scene_of(
         resets: episodes to play.
         task: whose scene it is.
         success_distance: metres.
+        context: as in `DerivedScene`.
 
     Raises:
         ValueError: the object has no mass, or the scene holds what cannot be copied.
@@ -114,6 +118,7 @@ def object_scene_of(
         resets.goals,
         substeps,
         success_distance,
+        context,
     )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..envs.goal_space import followed_space
 from ..envs.graphics import open_graphics
 from ..envs.physics_engine import mujoco
 from ..envs.picture import SIZE, add_point, check_process
@@ -93,14 +94,16 @@ class Drawn(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         self._picture: ScenePicture | None = None
+        self._space = followed_space(env.observation_space["desired_goal"].shape)  # type: ignore[index]
         self._goal = np.zeros(3)
 
     def reset(self, **options: Any) -> Any:
         """Start an episode."""
         obs, info = self.env.reset(**options)
-        self._goal = np.array(obs["desired_goal"], dtype=np.float64)
+        keys = ("achieved_goal", "desired_goal")
+        seen = self._space.point(np.array([obs[key] for key in keys], dtype=np.float64))
+        self._goal = seen[1]
         if self._picture is None:
-            seen = np.stack([np.array(obs["achieved_goal"], dtype=np.float64), self._goal])
             self._picture = ScenePicture(physics_of(self.env)[0], seen)
         return obs, info
 

@@ -9,11 +9,15 @@ from ..envs.batch import MAX_DISPLACEMENT
 from ..envs.faces import BatchVecEnv
 from ..envs.object_locomotion import ObjectSimulation
 from ..envs.physics_engine import mujoco
+from .context import located, place_numbers
 from .scene import POINT, PULLER, DerivedScene
 
 
 class DerivedSimulation(ObjectSimulation):
-    """As `ObjectSimulation`, of an object with any joints that starts where its task's does."""
+    """As `ObjectSimulation`, of an object with any joints that starts where its task's does.
+
+    Observations end with the context, where the task has one.
+    """
 
     scene: DerivedScene  # type: ignore[assignment]
 
@@ -24,11 +28,16 @@ class DerivedSimulation(ObjectSimulation):
         body = int(model.site_bodyid[self._object_site])
         self._root = int(model.body_rootid[body])
         self._body = body
+        self.observation_size = ObjectSimulation.observation_size + len(self.scene.context)
 
     def _take_memory(self) -> None:
         super()._take_memory()
         self._watch("spin_and_velocity", [d.cvel[self._body] for d in self.data])
         self._watch("centre", [d.subtree_com[self._root] for d in self.data])
+        if self.scene.context:
+            self._watch("positions", [d.xpos for d in self.data])
+            self._watch("quaternions", [d.xquat for d in self.data])
+            self._context = located(self.scene.context, self.scene.model)
         # The welded body's pose as the episode began: height and tilt that a surface keeps.
         self.read["first_pose"] = np.zeros((self.n_envs, 7))
 
@@ -52,6 +61,15 @@ class DerivedSimulation(ObjectSimulation):
             first = self.read["first_pose"]
             self._target_pos[:, 2] = first[:, 2]
             self._target_quat[:] = turned_about_vertical(self._target_quat, first[:, 3:])
+
+    def observe(self) -> tuple[np.ndarray, np.ndarray]:
+        """As `ObjectSimulation.observe`, with the context, (n_envs, 12 + c)."""
+        observation, achieved = super().observe()
+        if self.scene.context:
+            bodies, numbers = self._context
+            places = place_numbers(self.read["positions"], self.read["quaternions"])
+            observation = np.concatenate([observation, places[:, bodies, numbers]], axis=1)
+        return observation, achieved
 
     def _object_velocities(self) -> tuple[np.ndarray, np.ndarray]:
         """Velocity of the object's point and its spin, world frame, per env step, (n_envs, 3)."""

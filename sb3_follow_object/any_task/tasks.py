@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -11,6 +13,7 @@ from ..envs.goal_envs import missing_goal_keys
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
 from ..envs.tasks import SUCCESS_DISTANCE
+from .context import bodies_in
 from .derived import derived, object_horizon, told_effector
 from .finding import find_effector, observe
 from .simulation import DerivedObjectVecEnv
@@ -41,8 +44,9 @@ def what_is_followed(env_id: str) -> str:
     found = derived(env_id)
     within = f"goals are reached within {found.success_distance * 1e3:.0f} mm"
     shifted = "; rewards of 1 and 0 are shown as 0 and -1" if found.shifted else ""
-    unseen = f"; where {', '.join(found.varying)} stand is not seen" if found.varying else ""
-    return f"the object of {env_id} is {found.object.name}, {within}{shifted}{unseen}"
+    others = ", ".join(bodies_in(found.context))
+    seen = f"; nu and F_phi also see the place of {others}" if others else ""
+    return f"the object of {env_id} is {found.object.name}, {within}{shifted}{seen}"
 
 
 def success_distance_of(env_id: str) -> float:
@@ -61,6 +65,26 @@ def physics_of_task(env_id: str) -> str:
         ValueError: its object cannot be followed.
     """
     return physics_id(env_id) if env_id in IDS else derived(env_id).physics
+
+
+def context_of_task(env_id: str) -> tuple[str, ...]:
+    """What a task's episodes differ in beside start and goal, by the names of `read_context`.
+
+    Raises:
+        ValueError: its object cannot be followed.
+    """
+    return () if env_id in IDS else derived(env_id).context
+
+
+def kept_as(env_id: str) -> str:
+    """The folder's name of what is kept of a task: its physics, and what its F_phi sees.
+
+    Raises:
+        ValueError: its object cannot be followed.
+    """
+    context = context_of_task(env_id)
+    told = hashlib.sha256(" ".join(context).encode()).hexdigest()[:6]
+    return physics_of_task(env_id) + (f"-{told}" if context else "")
 
 
 def surface_choices(env_id: str, setting: bool | None = None) -> tuple[bool, ...]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..envs.physics_engine import mujoco
-from .robot_parts import carrier, robot_bodies, touching_geoms
+from .robot_parts import body_name, carrier, robot_bodies, touching_geoms
 
 JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
 _EQUALITIES = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_JOINT)
@@ -105,7 +105,7 @@ def _add_body(
     if body == 0:
         copied.bodies[0], copied.added[0] = "world", world
         return world
-    name = copied.bodies[body] = model.body(body).name or f"body:{body}"
+    name = copied.bodies[body] = body_name(model, body)
     if carrier(model, body) == 0:
         mocap = body in varying or model.body_mocapid[body] >= 0
         added = world.add_body(

@@ -159,7 +159,7 @@ def _imagined_frames(
     env = make_drawn(env_id)
     try:
         obs, _ = env.reset(seed=seed)
-        way, frames = imagined_way(predictor, obs), []
+        way, frames = imagined_way(predictor, obs, np.zeros(0)), []
         for level in np.linspace(0, len(way), n).round().astype(int):
             shown = way.copy()
             shown[level:] = _UNSEEN  # all are drawn, so that each keeps its colour

@@ -14,6 +14,7 @@ from ..any_task.scene_picture import GOAL_RGBA, START_RGBA, draw_points
 from ..any_task.simulation import DerivedObjectVecEnv
 from ..common.reports import Report
 from ..envs import IDS
+from ..envs.goal_space import goal_space
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
 from .pictures import write_png
@@ -41,7 +42,7 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
         "object": _object(found),
         "goal": _goal(found),
         "reached": f"within {found.success_distance * 1e3:.0f} mm" + _shifted(found),
-        "varies": ", ".join(found.varying) or "nothing but object and goal",
+        "varies": _varies(found),
         "moves": "on its surface, unless it does not learn so" if found.on_surface else "freely",
         "effector": _effector(found),
         "episodes": f"{found.horizon} steps; the object's {found.scene.task.horizon}",
@@ -61,7 +62,10 @@ def draw_found(env_id: str, out: Path) -> None:
     env = robot_maker(found.env_id)()
     try:
         env.reset(seed=0)
-        starts, goals = found.resets.starts[:_SHOWN], found.resets.goals[:_SHOWN]
+        starts, goals = (
+            goal_space(each.shape[1:]).point(each[:_SHOWN])
+            for each in (found.resets.starts, found.resets.goals)
+        )
         colours = np.repeat([START_RGBA, GOAL_RGBA], [len(starts), len(goals)], axis=0)
         write_png(out, draw_points(env, np.concatenate([starts, goals]), colours))
     finally:
@@ -79,12 +83,25 @@ def _object(found: Derived) -> str:
 
 def _goal(found: Derived) -> str:
     goals, starts = found.resets.goals, found.resets.starts
-    away = np.linalg.norm(goals - starts, axis=1)
-    up = np.round(goals[:, 2] - starts[:, 2], 2) + 0.0  # no minus before a zero
+    space = goal_space(goals.shape[1:])
+    away = space.distance(goals, starts)
+    up = np.round(space.height(goals) - space.height(starts), 2) + 0.0  # no minus before a zero
     return (
         f"{away.min():.2f} to {away.max():.2f} m from the start, "
         f"{up.min():.2f} to {up.max():.2f} m above it"
     )
+
+
+def _varies(found: Derived) -> str:
+    """What stands elsewhere in each episode, and whether nu and F_phi need to see where."""
+    seen: dict[str, list[str]] = {}
+    for name in found.context:
+        body, number = name.rsplit(" ", 1)
+        seen.setdefault(body, []).append(number)
+    told = ", ".join(f"{body} ({', '.join(numbers)})" for body, numbers in seen.items())
+    others = ", ".join(name for name in found.varying if name not in seen)
+    parts = (told and f"{told}: seen by nu and F_phi", others and f"{others}: need not be seen")
+    return "; ".join(part for part in parts if part) or "nothing but object and goal"
 
 
 def _shifted(found: Derived) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..any_task.context import read_context
 from ..any_task.scene_picture import GOAL_RGBA, Drawn, draw_points
 from ..common.extras import need
 from ..common.files import atomic_write
@@ -100,28 +101,38 @@ def draw_imagined(
         panels = []
         for panel in range(_PANELS):
             obs, _ = env.reset(seed=seed + panel)
-            way = imagined_way(predictor, obs)
+            way = imagined_way(predictor, obs, read_context(predictor.context, env))
             if env_id in IDS:
                 env.unwrapped.set_markers(way)  # type: ignore[attr-defined]
                 panels.append(frame(env))
             else:
-                panels.append(_imagined_elsewhere(env, way, obs["desired_goal"]))
+                goal = predictor.space.point(obs["desired_goal"][None])
+                panels.append(_imagined_elsewhere(env, way, goal))
         write_png(out, np.concatenate(panels, axis=1))
     finally:
         env.close()
 
 
 def _imagined_elsewhere(env: gym.Env, way: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Draw imagined goals (n, 3) and a goal (3,), in metres, in an environment of others."""
+    """Draw imagined goals (n, 3) and a goal (1, 3), in metres, in an environment of others."""
     levels = np.column_stack([marker_colours(len(way)), np.ones(len(way))])
     return draw_points(env, np.vstack([way, goal]), np.vstack([levels, GOAL_RGBA]))
 
 
-def imagined_way(predictor: GoalPredictor, obs: dict[str, np.ndarray]) -> np.ndarray:
-    """Imagined goals (25, 3), evenly along the way from where an episode begins to its goal."""
-    paths = predictor.paths(obs["achieved_goal"][None], obs["desired_goal"][None])
-    way: np.ndarray = points_along(paths, np.arange(1, _LEVELS + 1) / _LEVELS)[0]
-    return way
+def imagined_way(
+    predictor: GoalPredictor, obs: dict[str, np.ndarray], context: np.ndarray
+) -> np.ndarray:
+    """Where imagined goals are (25, 3), evenly along the way from an episode's start to its goal.
+
+    Args:
+        predictor: F_phi.
+        obs: that an episode begins with.
+        context: what F_phi sees beside it, (c,).
+    """
+    start, goal = obs["achieved_goal"][None], obs["desired_goal"][None]
+    paths = predictor.paths(start, goal, context[None])
+    shares = np.arange(1, _LEVELS + 1) / _LEVELS
+    return predictor.space.point(points_along(paths, shares, predictor.space)[0])
 
 
 def record(

@@ -9,9 +9,9 @@ import numpy as np
 from gymnasium import spaces
 
 from ..envs.goal_envs import missing_goal_keys
+from ..envs.goal_space import GoalSpace, followed_space
 from .curriculum import Curriculum
 from .goal_predictor import GoalPredictor
-from .predictor_files import POSITION
 
 Observation = dict[str, np.ndarray]
 
@@ -30,8 +30,10 @@ def check_horizons(predictor: GoalPredictor, curriculum: Curriculum) -> None:
         )
 
 
-def checked_goals(space: spaces.Space, has: Callable[[str], bool]) -> np.dtype[Any]:
-    """Refuse what cannot be wrapped; return the dtype of goals."""
+def checked_goals(
+    space: spaces.Space, has: Callable[[str], bool]
+) -> tuple[GoalSpace, np.dtype[Any]]:
+    """Refuse what cannot be wrapped; return the space of goals and their dtype."""
     missing = missing_goal_keys(space)
     if missing:
         raise ValueError(
@@ -39,17 +41,14 @@ def checked_goals(space: spaces.Space, has: Callable[[str], bool]) -> np.dtype[A
             f"this one lacks {missing}."
         )
     goals = cast(spaces.Dict, space)["desired_goal"]
-    if goals.shape != (POSITION,) or goals.dtype is None:
-        raise ValueError(
-            f"Imagined goals are object positions of shape (3,), "
-            f"this environment's goals have the shape {goals.shape}."
-        )
+    assert goals.dtype is not None
+    found = followed_space(goals.shape)
     if not has("compute_reward"):
         raise ValueError(
             "Imagined goals need an environment with compute_reward(achieved, desired, info), "
             "this one has none."
         )
-    return goals.dtype
+    return found, goals.dtype
 
 
 def terminal_observation(info: dict[str, Any]) -> Observation:

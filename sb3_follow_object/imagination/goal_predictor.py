@@ -5,36 +5,41 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import safetensors.torch
 import torch
-from torch import nn
 
 from ..common.copies import WholeCopies
 from ..common.files import atomic_write
 from ..common.numbers import checked_whole
 from ..common.torch_helpers import one_thread_after_forks, usable_device, usual_defaults
+from ..envs.goal_space import KINDS, POSITIONS, GoalSpace
 from ..settings.learning import PredictorSettings
 from .predictor_files import (
     FACTS_FILE,
     FORMAT,
-    INPUTS,
-    POSITION,
     SCALES,
     TENSORS_FILE,
     checked_facts,
     checked_tensors,
+    n_inputs,
+)
+from .predictor_training import (
+    Progress,
+    checked_contexts,
+    checked_paths,
+    initialise,
+    make_network,
+    make_samples,
+    train_network,
 )
 
 # Metres. The start's height is the same in all paths up to the solver's noise; divided by that
 # noise, half a millimetre in the robot's scene would be an input that the network has never seen.
 SMALLEST_STD = 1e-2
-
-Progress = Callable[[int, float], None]
 
 one_thread_after_forks()
 
@@ -49,9 +54,15 @@ class GoalPredictor(WholeCopies):
         env_id: gymnasium id of the task that it was made for.
         physics: short hash of the physics that it was made for.
         object_on_table: whether the object was kept on the table; None where that is not known.
+        space: of its positions and goals.
+        context: names of the numbers that it sees beside start and goal, of places of other things
+            (`any_task.context`).
         error_mm: mean distance to the held-out paths for each k in 1..T, shape (T,), millimetres.
         device: that it imagines on, the CPU unless `to` says another.
     """
+
+    space: GoalSpace = POSITIONS
+    context: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -63,17 +74,22 @@ class GoalPredictor(WholeCopies):
         physics: str,
         error_mm: np.ndarray,
         object_on_table: bool | None = None,
+        context: Sequence[str] = (),
+        space: GoalSpace = POSITIONS,
     ) -> None:
         self.hidden = tuple(hidden)
         self.horizon = horizon
         self.env_id = env_id
         self.physics = physics
         self.object_on_table = object_on_table
+        self.context = tuple(context)
+        self.space = space
         self.error_mm = error_mm
         self.device = torch.device("cpu")
         self._tensors = tensors
         with usual_defaults():
-            self._network = _network(self.hidden)
+            inputs = n_inputs(space, self.context)
+            self._network = make_network(inputs, self.hidden, space.n_encoded)
         self._network.load_state_dict(
             {name: value for name, value in tensors.items() if name not in SCALES}
         )
@@ -91,6 +107,8 @@ class GoalPredictor(WholeCopies):
         env_id: str,
         physics: str,
         object_on_table: bool | None = None,
+        context: Sequence[str] = (),
+        contexts: np.ndarray | None = None,
         hidden: Sequence[int] = PredictorSettings.hidden,
         learning_rate: float = PredictorSettings.learning_rate,
         batch_size: int = PredictorSettings.batch_size,
@@ -112,6 +130,9 @@ class GoalPredictor(WholeCopies):
             env_id: gymnasium id of the task, kept with the predictor.
             physics: hash of the task's physics, kept with the predictor.
             object_on_table: whether the object was kept on the table, kept with the predictor.
+            context: names of the numbers that the paths depend on beside start and goal.
+            contexts: these numbers, shape (n, len(context)), metres or parts of an axis; None where
+                there are none.
             hidden: widths of the hidden layers, each >= 1.
             learning_rate: of Adam, > 0.
             batch_size: samples an update, >= 1.
@@ -125,7 +146,8 @@ class GoalPredictor(WholeCopies):
         Raises:
             ValueError: an argument has a wrong shape or range, or holds NaN or infinity.
         """
-        paths, goals = _checked_paths(paths, goals)
+        paths, goals, space = checked_paths(paths, goals)
+        contexts = checked_contexts(contexts, len(paths), context)
         settings = PredictorSettings(
             hidden=hidden,
             learning_rate=learning_rate,
@@ -141,18 +163,18 @@ class GoalPredictor(WholeCopies):
         order = torch.randperm(n, generator=generator).numpy()
         test, train = order[:n_test], order[n_test:]
 
-        inputs, targets = _samples(paths[train], goals[train])
+        inputs, targets = make_samples(paths[train], goals[train], contexts[train], space)
         tensors = {
             "input_mean": torch.from_numpy(inputs.mean(axis=0)),
             "input_std": torch.from_numpy(np.maximum(inputs.std(axis=0), SMALLEST_STD)),
             "output_mean": torch.from_numpy(targets.mean(axis=0)),
             "output_std": torch.from_numpy(np.maximum(targets.std(axis=0), SMALLEST_STD)),
         }
-        network = _network(settings.hidden)
-        _initialise(network, generator)
+        network = make_network(n_inputs(space, context), settings.hidden, space.n_encoded)
+        initialise(network, generator)
         x = (torch.from_numpy(inputs) - tensors["input_mean"]) / tensors["input_std"]
         y = (torch.from_numpy(targets) - tensors["output_mean"]) / tensors["output_std"]
-        _train(
+        train_network(
             network.to(on),
             x.float().to(on),
             y.float().to(on),
@@ -171,10 +193,12 @@ class GoalPredictor(WholeCopies):
             env_id=env_id,
             physics=physics,
             object_on_table=object_on_table,
+            context=context,
+            space=space,
             error_mm=np.full(horizon, np.nan),
         )
-        imagined = predictor.paths(paths[test, 0], goals[test])
-        distance = np.linalg.norm(imagined[:, 1:] - paths[test, 1:], axis=2)
+        imagined = predictor.paths(paths[test, 0], goals[test], contexts[test])
+        distance = space.distance(imagined[:, 1:], paths[test, 1:])
         predictor.error_mm = 1000.0 * distance.mean(axis=0)
         return predictor
 
@@ -184,30 +208,39 @@ class GoalPredictor(WholeCopies):
         self._network.to(self.device)
         return self
 
-    def predict(self, start: np.ndarray, goal: np.ndarray, k: np.ndarray) -> np.ndarray:
+    def predict(
+        self,
+        start: np.ndarray,
+        goal: np.ndarray,
+        k: np.ndarray,
+        contexts: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return the imagined position at time-step k + 1, F_phi(o_1, g, k).
 
         Args:
             start: object positions o_1, shape (n, 3), metres.
             goal: goals g, shape (n, 3), metres.
             k: steps ahead, shape (n,) int, in 1..T.
+            contexts: as `context` names them, shape (n, len(context)); None where it is empty.
 
         Returns:
             positions, shape (n, 3) float64, metres.
 
         Raises:
-            ValueError: a shape is wrong, a k is no whole number in 1..T, or a start or a goal is
-                not finite.
+            ValueError: a shape is wrong, a k is no whole number in 1..T, or a start, a goal or a
+                context is not finite.
         """
         start, goal, k = (np.asarray(values) for values in (start, goal, k))
         n = len(k) if k.ndim == 1 else -1
-        if start.shape != (n, POSITION) or goal.shape != (n, POSITION):
+        space, size = self.space, self.space.size
+        if start.shape != (n, size) or goal.shape != (n, size):
             raise ValueError(
-                f"start, goal and k must have the shapes (n, 3), (n, 3) and (n,), "
+                f"start, goal and k must have the shapes (n, {size}), (n, {size}) and (n,), "
                 f"got {start.shape}, {goal.shape} and {k.shape}."
             )
+        contexts = checked_contexts(contexts, n, self.context)
         if n == 0:
-            return np.zeros((0, POSITION))
+            return np.zeros((0, size))
         for name, values in (("start", start), ("goal", goal), ("k", k)):
             if not (np.issubdtype(values.dtype, np.number) and np.isfinite(values).all()):
                 raise ValueError(f"{name} must hold finite numbers, got others in it.")
@@ -217,21 +250,25 @@ class GoalPredictor(WholeCopies):
             )
         if (k != np.round(k)).any():
             raise ValueError(f"k must hold whole numbers, got {k[k != np.round(k)][0]} in it.")
-        inputs = np.concatenate([start, goal, k[:, None]], axis=1, dtype=np.float64)
+        parts = space.encode(start), space.encode(goal), contexts, k[:, None]
+        inputs = np.concatenate(parts, axis=1, dtype=np.float64)
         with np.errstate(under="ignore"):
             scaled = (inputs - self._scales["input_mean"]) / self._scales["input_std"]
             scaled = scaled.astype(np.float32)
         with torch.inference_mode():
             on = torch.from_numpy(scaled).to(self.device)
             outputs = self._network(on).cpu().numpy()
-        return outputs * self._scales["output_std"] + self._scales["output_mean"]
+        return space.decode(outputs * self._scales["output_std"] + self._scales["output_mean"])
 
-    def paths(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    def paths(
+        self, start: np.ndarray, goal: np.ndarray, contexts: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return whole imagined paths, o_1 and then F_phi for k = 1..T.
 
         Args:
             start: object positions o_1, shape (n, 3), metres.
             goal: goals g, shape (n, 3), metres.
+            contexts: as in `predict`.
 
         Returns:
             paths, shape (n, T+1, 3) float64, metres.
@@ -241,8 +278,10 @@ class GoalPredictor(WholeCopies):
             np.repeat(start, self.horizon, axis=0),
             np.repeat(goal, self.horizon, axis=0),
             np.tile(np.arange(1, self.horizon + 1), len(start)),
+            *([] if contexts is None else [np.repeat(contexts, self.horizon, axis=0)]),
         )
-        return np.concatenate([start[:, None], ahead.reshape(-1, self.horizon, POSITION)], axis=1)
+        ahead = ahead.reshape(-1, self.horizon, self.space.size)
+        return np.concatenate([start[:, None], ahead], axis=1)
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write ``predictor.safetensors`` and ``predictor.json`` into ``folder``.
@@ -258,6 +297,8 @@ class GoalPredictor(WholeCopies):
             "env_id": self.env_id,
             "physics": self.physics,
             "object_on_table": self.object_on_table,
+            **({"goals": self.space.kind} if self.space.kind != POSITIONS.kind else {}),
+            **({"context": list(self.context)} if self.context else {}),
             "horizon": self.horizon,
             "hidden": list(self.hidden),
             "error_mm": self.error_mm.tolist(),
@@ -302,7 +343,10 @@ class GoalPredictor(WholeCopies):
                 f"The predictor in {folder} was made with object_on_table={made}, "
                 f"not {object_on_table}: fit one with that setting."
             )
-        tensors = checked_tensors(folder / TENSORS_FILE, facts["hidden"], facts["sha256"])
+        space, context = KINDS[facts.get("goals", POSITIONS.kind)], facts.get("context", [])
+        tensors = checked_tensors(
+            folder / TENSORS_FILE, space, facts["hidden"], context, facts["sha256"]
+        )
         return cls(
             tensors,
             hidden=facts["hidden"],
@@ -310,72 +354,7 @@ class GoalPredictor(WholeCopies):
             env_id=facts["env_id"],
             physics=facts["physics"],
             object_on_table=made,
+            context=context,
+            space=space,
             error_mm=np.array(facts["error_mm"], dtype=np.float64),
         )
-
-
-def _network(hidden: Sequence[int]) -> nn.Sequential:
-    """Return the network with its weights unset: setting them here would use the global RNG."""
-    widths = [INPUTS, *hidden]
-    layers: list[nn.Module] = []
-    for n_in, n_out in pairwise(widths):
-        layers += [nn.utils.skip_init(nn.Linear, n_in, n_out), nn.ReLU()]
-    layers.append(nn.utils.skip_init(nn.Linear, widths[-1], POSITION))
-    return nn.Sequential(*layers)
-
-
-def _initialise(network: nn.Sequential, generator: torch.Generator) -> None:
-    """Draw the weights as nn.Linear does by default, from ``generator``."""
-    for layer in network:
-        if isinstance(layer, nn.Linear):
-            bound = layer.in_features**-0.5
-            nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
-            nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
-
-
-def _samples(paths: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs (n * T, 7) and targets (n * T, 3) for every path and every k in 1..T."""
-    n, horizon = len(paths), paths.shape[1] - 1
-    fixed = np.repeat(np.concatenate([paths[:, 0], goals], axis=1), horizon, axis=0)
-    k = np.tile(np.arange(1.0, horizon + 1), n)[:, None]
-    return np.concatenate([fixed, k], axis=1), paths[:, 1:].reshape(-1, POSITION)
-
-
-def _train(
-    network: nn.Sequential,
-    inputs: torch.Tensor,
-    targets: torch.Tensor,
-    *,
-    learning_rate: float,
-    batch_size: int,
-    epochs: int,
-    generator: torch.Generator,
-    progress: Progress | None,
-) -> None:
-    optimiser = torch.optim.Adam(network.parameters(), lr=learning_rate)
-    for epoch in range(1, epochs + 1):
-        order = torch.randperm(len(inputs), generator=generator).to(inputs.device)
-        total = torch.zeros((), device=inputs.device)
-        for x, y in zip(
-            inputs[order].split(batch_size), targets[order].split(batch_size), strict=True
-        ):
-            loss = nn.functional.mse_loss(network(x), y)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            total += loss.detach() * len(x)
-        if progress is not None:
-            progress(epoch, float(total) / len(inputs))
-
-
-def _checked_paths(paths: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    paths, goals = np.asarray(paths, dtype=np.float64), np.asarray(goals, dtype=np.float64)
-    if paths.ndim != 3 or len(paths) < 2 or paths.shape[1] < 2 or paths.shape[2] != POSITION:
-        raise ValueError(
-            f"paths must have the shape (n, T+1, 3) with n >= 2 and T >= 1, got {paths.shape}."
-        )
-    if goals.shape != (len(paths), POSITION):
-        raise ValueError(f"goals must have the shape ({len(paths)}, 3), got {goals.shape}.")
-    if not (np.isfinite(paths).all() and np.isfinite(goals).all()):
-        raise ValueError("paths and goals must be finite, got NaN or infinity in them.")
-    return paths, goals

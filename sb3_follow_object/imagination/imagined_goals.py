@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.answers import check_shape
+from ..envs.goal_space import POSITIONS, GoalSpace
 from .curriculum import Curriculum
 from .goal_predictor import GoalPredictor
 
@@ -16,6 +17,7 @@ def imagine(
     start: np.ndarray,
     goal: np.ndarray,
     level: np.ndarray,
+    contexts: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the imagined goals h of given levels (paper, section 4.3).
 
@@ -25,6 +27,7 @@ def imagine(
         start: object positions o_1, shape (n, 3), metres.
         goal: original goals g, shape (n, 3), metres.
         level: shape (n,) int, in 1..curriculum.n_levels.
+        contexts: where other things stand, shape (n, c); None where F_phi sees none.
 
     Returns:
         h, shape (n, 3) float64, metres.
@@ -36,9 +39,9 @@ def imagine(
     if level.size and not (level.min() >= 1 and level.max() <= curriculum.n_levels):
         raise ValueError(f"Levels must lie in 1..{curriculum.n_levels}, got {level.tolist()}.")
     if curriculum.levels == "time":
-        imagined = predictor.predict(start, goal, level)
+        imagined = predictor.predict(start, goal, level, contexts)
     else:
-        levels = _all_levels(predictor, curriculum, start, goal)
+        levels = _all_levels(predictor, curriculum, start, goal, contexts)
         imagined = levels[np.arange(len(level)), level - 1]
     check_shape(imagined, np.shape(start), "the goals that the predictor imagines")
     return imagined
@@ -51,6 +54,7 @@ def draw_goals(
     start: np.ndarray,
     goal: np.ndarray,
     rng: np.random.Generator,
+    contexts: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw the goal that each of n new training episodes shows (paper, Algorithm 1).
 
@@ -64,6 +68,7 @@ def draw_goals(
         start: object positions o_1, shape (n, 3), metres.
         goal: original goals g, shape (n, 3), metres.
         rng: source of randomness.
+        contexts: as in `imagine`.
 
     Returns:
         shown goals, shape (n, 3) float64, metres; levels, shape (n,) int64, 0 where original.
@@ -74,13 +79,18 @@ def draw_goals(
     rows = np.flatnonzero(~original)
     if not rows.size:
         return shown, level
-    shown[rows] = imagine(predictor, curriculum, start[rows], goal[rows], level[rows])
-    distance = np.linalg.norm(shown[rows] - start[rows], axis=1)
-    near = rows[distance < curriculum.min_distance]
+
+    def seen(rows: np.ndarray) -> np.ndarray | None:
+        return None if contexts is None else contexts[rows]
+
+    shown[rows] = imagine(predictor, curriculum, start[rows], goal[rows], level[rows], seen(rows))
+    distance = predictor.space.distance
+    near = rows[distance(shown[rows], start[rows]) < curriculum.min_distance]
     if near.size:
         choices = curriculum.drawable()
-        ways = _all_levels(predictor, curriculum, start[near], goal[near])[:, choices - 1]
-        far = np.linalg.norm(ways - start[near, None], axis=2) >= curriculum.min_distance
+        every = _all_levels(predictor, curriculum, start[near], goal[near], seen(near))
+        ways = every[:, choices - 1]
+        far = distance(ways, start[near, None]) >= curriculum.min_distance
         for row, way, mask in zip(near, ways, far, strict=True):
             # One draw among the far levels has the distribution of drawing until a level is far.
             choice = rng.choice(np.flatnonzero(mask)) if mask.any() else None
@@ -90,26 +100,32 @@ def draw_goals(
 
 
 def _all_levels(
-    predictor: GoalPredictor, curriculum: Curriculum, start: np.ndarray, goal: np.ndarray
+    predictor: GoalPredictor,
+    curriculum: Curriculum,
+    start: np.ndarray,
+    goal: np.ndarray,
+    contexts: np.ndarray | None,
 ) -> np.ndarray:
     """Return the imagined goals of every level, shape (n, n_levels, 3)."""
-    paths = predictor.paths(start, goal)
+    paths = predictor.paths(start, goal, contexts)
     if curriculum.levels == "time":
         return paths[:, 1:]
-    return points_along(paths, np.arange(1, curriculum.n_levels + 1) / curriculum.n_levels)
+    shares = np.arange(1, curriculum.n_levels + 1) / curriculum.n_levels
+    return points_along(paths, shares, predictor.space)
 
 
-def points_along(paths: np.ndarray, shares: np.ndarray) -> np.ndarray:
+def points_along(paths: np.ndarray, shares: np.ndarray, space: GoalSpace = POSITIONS) -> np.ndarray:
     """Interpolate paths at shares of their length.
 
     Args:
         paths: shape (n, m, 3), m >= 2, metres.
         shares: shape (s,), in [0, 1].
+        space: of the paths.
 
     Returns:
         points, shape (n, s, 3); share 1 is the path's end.
     """
-    steps = np.linalg.norm(np.diff(paths, axis=1), axis=2)
+    steps = space.distance(paths[:, 1:], paths[:, :-1])
     travelled = np.concatenate([np.zeros((len(paths), 1)), np.cumsum(steps, axis=1)], axis=1)
     wanted = travelled[:, -1:] * shares  # (n, s)
     # Index of the step in which the wanted length is reached.
@@ -117,12 +133,16 @@ def points_along(paths: np.ndarray, shares: np.ndarray) -> np.ndarray:
     row = np.arange(len(paths))[:, None]
     # A path of length zero stays where it is: nothing to divide.
     length = np.maximum(steps[row, step], np.finfo(np.float64).tiny)
-    part = np.clip((wanted - travelled[row, step]) / length, 0.0, 1.0)[..., None]
-    return (1.0 - part) * paths[row, step] + part * paths[row, step + 1]
+    part = np.clip((wanted - travelled[row, step]) / length, 0.0, 1.0)
+    return space.between(paths[row, step], paths[row, step + 1], part)
 
 
 def ahead(
-    predictor: GoalPredictor, start: np.ndarray, goal: np.ndarray, distance: float
+    predictor: GoalPredictor,
+    start: np.ndarray,
+    goal: np.ndarray,
+    distance: float,
+    contexts: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the first points of imagined paths that lie so far from their starts.
 
@@ -131,12 +151,13 @@ def ahead(
         start: object positions o_1, shape (n, 3), metres.
         goal: original goals g, shape (n, 3), metres.
         distance: metres.
+        contexts: as in `imagine`.
 
     Returns:
         points, shape (n, 3), metres; the end of a path that goes nowhere so far.
     """
-    paths = predictor.paths(start, goal)
-    far = np.linalg.norm(paths - paths[:, :1], axis=2) >= distance
+    paths = predictor.paths(start, goal, contexts)
+    far = predictor.space.distance(paths, paths[:, :1]) >= distance
     first = np.where(far.any(axis=1), far.argmax(axis=1), paths.shape[1] - 1)
     points: np.ndarray = paths[np.arange(len(paths)), first]
     return points

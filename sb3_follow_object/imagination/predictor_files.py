@@ -14,10 +14,8 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError
 
+from ..envs.goal_space import KINDS, POSITIONS, GoalSpace
 from ..settings.kinds import LAYERS_LIMIT, WIDTH_LIMIT
-
-POSITION = 3  # coordinates of an object position
-INPUTS = 2 * POSITION + 1  # o_1, g, k
 
 TENSORS_FILE = "predictor.safetensors"
 FACTS_FILE = "predictor.json"
@@ -25,13 +23,13 @@ FORMAT = 1
 FACTS_LIMIT = 1 << 20  # bytes
 HEADER_LIMIT = 1 << 20  # bytes that a tensors file may hold beside the numbers
 HORIZON_LIMIT = 100_000
-# Names and lengths of the tensors that are not weights.
-SCALES = {
-    "input_mean": INPUTS,
-    "input_std": INPUTS,
-    "output_mean": POSITION,
-    "output_std": POSITION,
-}
+CONTEXT_LIMIT = 1000  # numbers of a context
+SCALES = ("input_mean", "input_std", "output_mean", "output_std")  # tensors that are not weights
+
+
+def n_inputs(goals: GoalSpace, context: Sequence[str]) -> int:
+    """Return how many numbers F_phi sees: o_1, g, those of the context, k."""
+    return 2 * goals.n_encoded + len(context) + 1
 
 
 def valid_hidden(hidden: Any) -> bool:
@@ -64,6 +62,15 @@ def checked_facts(path: Path) -> dict[str, Any]:
     horizon, errors = facts.get("horizon"), facts.get("error_mm")
     if type(horizon) is not int or not 1 <= horizon <= HORIZON_LIMIT:
         raise ValueError(f"{damaged}: horizon must lie in 1..{HORIZON_LIMIT}, got {horizon!r}.")
+    if facts.get("goals", POSITIONS.kind) not in KINDS:
+        raise ValueError(f"{damaged}: goals must be of one of the kinds {list(KINDS)}.")
+    context = facts.get("context", [])  # only where there is one
+    if (
+        not isinstance(context, list)
+        or len(context) > CONTEXT_LIMIT
+        or not all(isinstance(name, str) and " " in name for name in context)
+    ):
+        raise ValueError(f"{damaged}: context is not a list of bodies' names and their numbers'.")
     if not valid_hidden(facts.get("hidden")):
         raise ValueError(f"{damaged}: hidden is not a list of widths.")
     if (
@@ -75,22 +82,26 @@ def checked_facts(path: Path) -> dict[str, Any]:
     return facts
 
 
-def checked_tensors(path: Path, hidden: Sequence[int], sha256: str) -> dict[str, torch.Tensor]:
+def checked_tensors(
+    path: Path, goals: GoalSpace, hidden: Sequence[int], context: Sequence[str], sha256: str
+) -> dict[str, torch.Tensor]:
     """Return a predictor's weights, float32, and scales, float64, by their names.
 
     Args:
         path: of the safetensors file.
+        goals: what they are.
         hidden: widths of the hidden layers.
+        context: names of its numbers.
         sha256: digest of the file's bytes.
 
     Raises:
         ValueError: it is missing, oversized or another file, or holds what no predictor does.
     """
+    inputs, outputs = n_inputs(goals, context), goals.n_encoded
     expected: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-        name: ((length,), torch.float64) for name, length in SCALES.items()
+        name: ((inputs if name.startswith("input") else outputs,), torch.float64) for name in SCALES
     }
-    widths = [INPUTS, *hidden, POSITION]
-    for layer, (n_in, n_out) in enumerate(pairwise(widths)):
+    for layer, (n_in, n_out) in enumerate(pairwise([inputs, *hidden, outputs])):
         # A ReLU stands between two linear layers, so these have the even places.
         expected[f"{2 * layer}.weight"] = ((n_out, n_in), torch.float32)
         expected[f"{2 * layer}.bias"] = ((n_out,), torch.float32)

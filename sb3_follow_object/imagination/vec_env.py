@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from ..any_task.context import bodies_in, read_context
 from ..common.answers import check_shape, one_each
 from ..common.vec_env_copies import CopyableVecEnvWrapper, let_vec_envs_be_copied
+from ..envs.robot_copies import ProcessVecEnv
 from .curriculum import Curriculum
 from .goal_env import (
     STREAM,
@@ -28,7 +31,6 @@ from .goal_env import (
 )
 from .goal_predictor import GoalPredictor
 from .imagined_goals import ahead, draw_goals, imagine
-from .predictor_files import POSITION
 
 let_vec_envs_be_copied()
 
@@ -65,17 +67,19 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
         if mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {mode!r}.")
         super().__init__(venv)
-        self._dtype = checked_goals(venv.observation_space, venv.has_attr)
+        self._space, self._dtype = checked_goals(venv.observation_space, venv.has_attr)
         check_horizons(predictor, curriculum)
         self._success_method = success_method(venv.has_attr)
         self.predictor = predictor
         self.curriculum = curriculum
         self.mode = mode
         self._rng = np.random.default_rng()
-        self._shown = np.zeros((venv.num_envs, POSITION), self._dtype)
+        self._shown = np.zeros((venv.num_envs, self._space.size), self._dtype)
         self._original = self._shown.copy()
         self._level = np.zeros(venv.num_envs, dtype=np.int64)
-        self._start = np.zeros((venv.num_envs, POSITION))
+        self._start = np.zeros((venv.num_envs, self._space.size))
+        self._contexts = np.zeros((venv.num_envs, len(predictor.context)))
+        _read_contexts(venv, [], predictor.context)  # refused now rather than at the first reset
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the environments and the draw of goals; takes effect at the next reset."""
@@ -103,7 +107,7 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
         for i in ended:
             last = terminal_observation(infos[i])
             for array, key in ((achieved, "achieved_goal"), (goals, "desired_goal")):
-                check_shape(last[key], (POSITION,), f"the terminal observation {key!r}")
+                check_shape(last[key], (self._space.size,), f"the terminal observation {key!r}")
                 array[i] = last[key]
         check_goal_stays(goals, self._original)
 
@@ -154,19 +158,22 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
         Only with an inner state can running episodes be continued by ``set_state``; without one,
         reset after it. The curriculum, shared with others, is not part of it.
         """
-        state = {
+        state: dict[str, Any] = {
             "shown": self._shown.copy(),
             "original": self._original.copy(),
             "level": self._level.copy(),
             "rng": copy.deepcopy(self._rng.bit_generator.state),
         }
+        if self.predictor.context:
+            state["contexts"] = self._contexts.copy()
         if hasattr(self.venv, "get_state"):
             state["venv"] = self.venv.get_state()
         return state
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Continue from ``get_state`` of a wrapper of the same size."""
-        for name in ("shown", "original", "level"):
+        contexts = ("contexts",) if self.predictor.context else ()
+        for name in ("shown", "original", "level", *contexts):
             current, saved = getattr(self, f"_{name}"), np.asarray(state[name])
             if saved.shape != current.shape:
                 raise ValueError(
@@ -185,18 +192,21 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
             rows: copies whose episodes have just begun, (m,).
             distance: metres from where the object is.
         """
-        return ahead(self.predictor, self._start[rows], self._original[rows], distance)
+        start, goal, contexts = self._start[rows], self._original[rows], self._contexts[rows]
+        return ahead(self.predictor, start, goal, distance, contexts)
 
     def _draw(self, rows: np.ndarray, obs: Observation) -> None:
         """Give the episodes that start in ``rows`` their goals."""
         for key in ("achieved_goal", "desired_goal"):
             check_shape(obs[key], self._shown.shape, f"the observation {key!r}")
         start, goal = obs["achieved_goal"][rows], obs["desired_goal"][rows]
+        predictor, curriculum = self.predictor, self.curriculum
+        contexts = self._contexts[rows] = _read_contexts(self.venv, rows, predictor.context)
         if self.mode == "test":
-            level = np.full(len(rows), self.curriculum.k_max)
-            shown = imagine(self.predictor, self.curriculum, start, goal, level)
+            level = np.full(len(rows), curriculum.k_max)
+            shown = imagine(predictor, curriculum, start, goal, level, contexts)
         else:
-            shown, level = draw_goals(self.predictor, self.curriculum, start, goal, self._rng)
+            shown, level = draw_goals(predictor, curriculum, start, goal, self._rng, contexts)
         with np.errstate(under="ignore"):
             self._shown[rows], self._original[rows], self._level[rows] = shown, goal, level
         self._start[rows] = start
@@ -211,10 +221,36 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
 
     def _facts(self) -> list[dict[str, Any]]:
         """What the infos of each copy say of its episode."""
-        return [
+        facts: list[dict[str, Any]] = [
             {"original_goal": goal, "imagined_level": level}
             for goal, level in zip(self._original.copy(), self._level.tolist(), strict=True)
         ]
+        if self.predictor.context:
+            for fact, context in zip(facts, self._contexts.copy(), strict=True):
+                fact["context"] = context
+        return facts
+
+
+def _read_contexts(venv: VecEnv, rows: Sequence[int] | np.ndarray, names: Sequence[str]) -> Any:
+    """Return what F_phi sees beside start and goal, of some copies as they are now, (m, c).
+
+    Raises:
+        ValueError: the copies cannot be looked into.
+    """
+    if not names:
+        return np.zeros((len(rows), 0))
+    copies = venv.unwrapped
+    if isinstance(copies, ProcessVecEnv):
+        read = copies.apply(partial(read_context, names), rows)
+    elif isinstance(copies, DummyVecEnv):
+        read = [read_context(names, copies.envs[row]) for row in rows]
+    else:
+        raise ValueError(
+            f"the predictor sees the place of {', '.join(bodies_in(names))}, which the copies of a "
+            f"{type(copies).__name__} cannot be asked for; give each of them an "
+            "ImaginedGoalWrapper, or take a DummyVecEnv"
+        )
+    return np.reshape(read, (len(rows), len(names)))
 
 
 def imagination_of(env: VecEnv | None, asker: str) -> tuple[GoalPredictor, Curriculum]:

@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ..any_task.context import read_context
 from ..any_task.tasks import steps_of_object
 from ..common.answers import check_shape, one_number
 from ..common.copies import WholeCopies
@@ -29,7 +30,6 @@ from .goal_env import (
 )
 from .goal_predictor import GoalPredictor
 from .imagined_goals import ahead, draw_goals, imagine
-from .predictor_files import POSITION
 
 AUTO = "auto"  # the predictor that is kept for the environment's task, learned where it is not
 
@@ -41,8 +41,9 @@ class ImaginedGoalWrapper(
 
     Infos carry ``original_goal`` (3,) in metres, ``imagined_level`` (0 where the original goal is
     shown) and, after each step, ``is_success`` for the shown and ``original_success`` for the
-    original goal. When an episode ends is left to the environment: one that terminates on its goal
-    still does so on the original one.
+    original goal; ``context`` (c,), too, if F_phi sees the places of other things. When an episode
+    ends is left to the environment: one that terminates on its goal still does so on the original
+    one.
 
     A wrapper that is given a Curriculum imagines goals at once. One that is given settings shows
     original goals until a CurriculumCallback takes it up at the start of training. So the same
@@ -72,7 +73,7 @@ class ImaginedGoalWrapper(
         curriculum: Curriculum | Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(env)
-        self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)
+        self._space, self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)
         self._compute_reward = env.get_wrapper_attr("compute_reward")
         self._is_success = env.get_wrapper_attr(success_method(env.has_wrapper_attr))
         self.active = isinstance(curriculum, Curriculum)
@@ -84,9 +85,10 @@ class ImaginedGoalWrapper(
         if isinstance(predictor, GoalPredictor):
             check_horizons(predictor, self.curriculum)
         self._rng = np.random.default_rng()
-        self._shown = self._original = np.zeros(POSITION, self._dtype)
+        self._shown = self._original = np.zeros(self._space.size, self._dtype)
         self._level = 0
-        self._start = np.zeros(POSITION)
+        self._start = np.zeros(self._space.size)
+        self._context = np.zeros(0)  # where other things stand that F_phi sees
 
     @property
     def predictor(self) -> GoalPredictor:
@@ -104,11 +106,12 @@ class ImaginedGoalWrapper(
             self._rng = np.random.default_rng([seed, STREAM])
         obs, info = self.env.reset(seed=seed, options=options)
         for key in ("achieved_goal", "desired_goal"):
-            check_shape(obs[key], (POSITION,), f"the observation {key!r}")
+            check_shape(obs[key], (self._space.size,), f"the observation {key!r}")
         self._original = obs["desired_goal"].copy()
         self._shown, self._level = self._original, 0
         self._start = np.array(obs["achieved_goal"], dtype=np.float64)
         if self.active:
+            self._context = read_context(self.predictor.context, self.env)
             shown, level = self._draw(obs["achieved_goal"][None], obs["desired_goal"][None])
             with np.errstate(under="ignore"):
                 self._shown, self._level = shown[0].astype(self._dtype), int(level[0])
@@ -135,7 +138,9 @@ class ImaginedGoalWrapper(
     def load_curriculum(self, state: dict[str, Any]) -> None:
         """Follow a curriculum that advances elsewhere (``Curriculum.state_dict``), from now on."""
         self.curriculum.load_state_dict(state)
-        self.active = True
+        if not self.active:
+            self.active = True
+            self._context = read_context(self.predictor.context, self.env)
 
     def ahead(self, distance: float) -> np.ndarray:
         """Return where F_phi sees the object after so much of its way, (3,); metres both.
@@ -144,14 +149,20 @@ class ImaginedGoalWrapper(
         """
         if not self.active:
             return self._original
-        return ahead(self.predictor, self._start[None], self._original[None], distance)[0]
+        start, goal, contexts = self._start[None], self._original[None], self._context[None]
+        return ahead(self.predictor, start, goal, distance, contexts)[0]
 
     def _draw(self, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the goal shown (1, 3) and its level (1,) in an episode that begins."""
         if self.mode == "test":
             level = np.array([self.curriculum.k_max])
-            return imagine(self.predictor, self.curriculum, start, goal, level), level
-        return draw_goals(self.predictor, self.curriculum, start, goal, self._rng)
+            shown = imagine(
+                self.predictor, self.curriculum, start, goal, level, self._context[None]
+            )
+            return shown, level
+        return draw_goals(
+            self.predictor, self.curriculum, start, goal, self._rng, self._context[None]
+        )
 
     def _succeeds(self, achieved: np.ndarray, desired: np.ndarray) -> bool:
         return bool(one_number(self._is_success(achieved, desired), "the environment's is_success"))
@@ -160,7 +171,8 @@ class ImaginedGoalWrapper(
         return {**obs, "desired_goal": self._shown.copy()}
 
     def _facts(self) -> dict[str, Any]:
-        return {"original_goal": self._original.copy(), "imagined_level": self._level}
+        facts = {"original_goal": self._original.copy(), "imagined_level": self._level}
+        return {**facts, "context": self._context} if self._context.size else facts
 
 
 def _find_predictor(source: str | os.PathLike[str], env: gym.Env) -> GoalPredictor:

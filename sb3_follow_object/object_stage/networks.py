@@ -18,13 +18,13 @@ from ..common.reports import reason
 from ..common.torch_helpers import WholeModule, lowest, usual_defaults
 from ..ddpg.her_ddpg import HerDDPG
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
-from ..imagination.predictor_files import valid_hidden
+from ..imagination.predictor_files import CONTEXT_LIMIT, valid_hidden
 from ..settings.kinds import CRITICS_LIMIT
 from ..settings.learning import InverseSettings
 
 FILE = "object_networks.safetensors"
 FORMAT = 1
-OBSERVATION, GOAL, ACTION = 12, 3, 7  # of the object's environment
+OBSERVATION, GOAL, ACTION = 12, 3, 7  # of the object's environment, without a context
 
 
 class ObjectNetworks(WholeModule):
@@ -39,6 +39,7 @@ class ObjectNetworks(WholeModule):
         n_critics: whose lowest value counts.
         layer_norm: whether the critics have LayerNorm.
         clip: of the standardised inputs.
+        n_context: numbers that the object's observations end with, about other things.
 
     Attributes:
         inverse_error: mean squared error of the inverse model at the end of its fit; NaN before.
@@ -54,6 +55,7 @@ class ObjectNetworks(WholeModule):
         n_critics: int = 1,
         layer_norm: bool = False,
         clip: float = 5.0,
+        n_context: int = 0,
     ) -> None:
         super().__init__()
         self.env_id = env_id
@@ -65,12 +67,14 @@ class ObjectNetworks(WholeModule):
             "n_critics": n_critics,
             "layer_norm": layer_norm,
             "clip": clip,
+            **({"n_context": n_context} if n_context else {}),
         }
+        self.n_observed = OBSERVATION + n_context
         self.inverse_error = float("nan")
         # What is drawn here is replaced.
         with usual_defaults(), th.random.fork_rng(devices=[]):
             policy = HerPolicy(
-                _dict_space(),
+                _dict_space(self.n_observed),
                 spaces.Box(-1.0, 1.0, (ACTION,), np.float32),
                 lambda progress: 0.0,
                 net_arch={"pi": list(pi), "qf": list(qf)},
@@ -78,7 +82,7 @@ class ObjectNetworks(WholeModule):
                 features_clip=clip,
                 n_critics=n_critics,
             )
-            n_inputs = policy.actor.features_dim + OBSERVATION
+            n_inputs = policy.actor.features_dim + self.n_observed
             layers = create_mlp(n_inputs, ACTION, list(inverse), squash_output=True)
         assert isinstance(policy.actor.features_extractor, NormalizedGoalExtractor)
         self.extractor = policy.actor.features_extractor
@@ -133,6 +137,9 @@ class ObjectNetworks(WholeModule):
             )
         pi, qf = get_actor_critic_arch(policy.net_arch)
         extractor = model.actor.features_extractor
+        assert isinstance(model.observation_space, spaces.Dict)
+        observed = model.observation_space["observation"]
+        assert isinstance(observed, spaces.Box)
         assert isinstance(extractor, NormalizedGoalExtractor)
         networks = cls(
             env_id,
@@ -143,6 +150,7 @@ class ObjectNetworks(WholeModule):
             n_critics=len(model.critic.q_networks),
             layer_norm=policy.critic_layer_norm,
             clip=extractor.clip,
+            n_context=observed.shape[0] - OBSERVATION,
         ).to(model.device)
         networks.extractor.load_state_dict(extractor.state_dict())
         networks.nu.load_state_dict(model.actor.mu.state_dict())
@@ -199,7 +207,7 @@ class ObjectNetworks(WholeModule):
 
     def infer(self, states: th.Tensor, next_states: th.Tensor, goals: th.Tensor) -> th.Tensor:
         """Return the actions (n, 7) that would have led from states to next states (n, 12)."""
-        after = self.features(next_states, goals)[:, :OBSERVATION]
+        after = self.features(next_states, goals)[:, : self.n_observed]
         return self.inverse(th.cat([self.features(states, goals), after], dim=1))
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -261,8 +269,8 @@ class ObjectNetworks(WholeModule):
                 )
 
 
-def _dict_space() -> spaces.Dict:
-    sizes = {"observation": OBSERVATION, "achieved_goal": GOAL, "desired_goal": GOAL}
+def _dict_space(n_observed: int) -> spaces.Dict:
+    sizes = {"observation": n_observed, "achieved_goal": GOAL, "desired_goal": GOAL}
     return spaces.Dict({key: spaces.Box(-np.inf, np.inf, (n,)) for key, n in sizes.items()})
 
 
@@ -271,6 +279,8 @@ def _check_shape(shape: Any) -> None:
     for name in ("pi", "qf", "inverse"):
         if not valid_hidden(shape[name]):
             raise ValueError(f"{name} has hidden layers {shape[name]!r}")
+    if shape.get("n_context", 0) not in range(CONTEXT_LIMIT + 1):
+        raise ValueError(f"n_context is {shape['n_context']!r}")
     if type(shape["n_critics"]) is not int or not 1 <= shape["n_critics"] <= CRITICS_LIMIT:
         raise ValueError(f"n_critics is {shape['n_critics']!r}")
     if type(shape["layer_norm"]) is not bool or not float(shape["clip"]) > 0.0:

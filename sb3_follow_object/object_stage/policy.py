@@ -14,6 +14,7 @@ from ..callbacks.copyable import CopyableCallback
 from ..callbacks.rollout import run_episodes
 from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
 from ..ddpg.her_ddpg import HerDDPG
+from ..envs.object_locomotion import ObjectSimulation
 from ..settings.stages import StageSettings
 
 
@@ -24,12 +25,14 @@ class ObjectPaths:
     Attributes:
         positions: (n, T + 1, 3) o_1 .. o_{T+1} in metres.
         goals: (n, 3) the goal of each path in metres.
+        contexts: (n, c) what else the object saw as each path began.
         success_rate: share of the paths that end on their goal.
         env_steps: steps simulated for them.
     """
 
     positions: np.ndarray
     goals: np.ndarray
+    contexts: np.ndarray
     success_rate: float
     env_steps: int
 
@@ -179,15 +182,19 @@ def collect_paths(model: Any, env: VecEnv, n_episodes: int) -> ObjectPaths:
     current: list[np.ndarray] = []
     paths: list[np.ndarray] = []
     goals: list[np.ndarray] = []
+    contexts: list[np.ndarray] = []
+    begun: list[np.ndarray] = []  # contexts of running episodes
 
     def keep(obs: Any, actions: Any, rewards: Any, dones: Any, infos: Any, next_obs: Any) -> None:
         if not current:
             current.append(obs["achieved_goal"].copy())
+            begun.append(obs["observation"][:, ObjectSimulation.observation_size :].copy())
         current.append(next_obs["achieved_goal"].copy())
         if dones.all():
             good = ["diverged" not in info for info in infos]
             paths.append(np.stack(current, axis=1)[good])
             goals.append(obs["desired_goal"][good])
+            contexts.append(begun.pop()[good])
             current.clear()
         elif dones.any():
             raise ValueError("the object's episodes differ in length; F_phi needs a fixed horizon")
@@ -199,5 +206,9 @@ def collect_paths(model: Any, env: VecEnv, n_episodes: int) -> ObjectPaths:
         keep,
     )
     return ObjectPaths(
-        np.concatenate(paths), np.concatenate(goals), episodes.success_rate, episodes.env_steps
+        np.concatenate(paths),
+        np.concatenate(goals),
+        np.concatenate(contexts),
+        episodes.success_rate,
+        episodes.env_steps,
     )

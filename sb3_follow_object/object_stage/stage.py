@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from ..any_task.tasks import (
     SURFACE_STEPS,
+    context_of_task,
     object_vec_env,
     physics_of_task,
     surface_choices,
@@ -160,6 +161,8 @@ class ObjectStage:
             env_id=self.env_id,
             physics=physics_of_task(self.env_id),
             object_on_table=self.on_table,
+            context=context_of_task(self.env_id),
+            contexts=paths.contexts,
             seed=stream_seed(self.seed, "predictor"),
             progress=lambda epoch, loss: between_epochs(),
             **{"device": str(model.device), **settings["predictor_fit"]},

@@ -12,6 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from ..envs import IDS
 from ..envs.goal_envs import missing_goal_keys
+from ..envs.goal_space import followed_space, goal_space
 from ..settings.stages import ReachFirstSettings, part_of_reach
 from .actor import ReachActor
 
@@ -66,7 +67,7 @@ class Approach:
         Args:
             rows: the copies, (m,).
             obs: of all copies.
-            ahead: where each object shall go next, (m, 3) metres.
+            ahead: where each object shall go next, goals (m, 3).
         """
         chosen = self.rng.random(len(rows)) < self.share
         self._idle[rows] = self.rng.uniform(-1.0, 1.0, self._idle[rows].shape)
@@ -74,9 +75,10 @@ class Approach:
         self._leg[rows] = ABOVE if self.settings.height > 0.0 else TO_PLACE
         self._steps[rows] = 0
         self.came[rows] = False
-        place = np.array(obs["achieved_goal"][rows], dtype=np.float64)
+        space = goal_space(obs["achieved_goal"].shape[1:])
+        place = np.array(space.point(obs["achieved_goal"][rows]), dtype=np.float64)
         if self.settings.standoff > 0.0:
-            way = ahead - place
+            way = space.point(ahead) - place
             way[:, 2] = 0.0
             length = np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
             place -= self.settings.standoff * way / length
@@ -177,11 +179,7 @@ def check_reachable(
             f"Reaching first needs Dict goal observations; this environment lacks {missing}."
         )
     keys = cast(spaces.Dict, space)
-    if keys["achieved_goal"].shape != (3,):
-        raise ValueError(
-            "Reaching first needs goals that are object positions of shape (3,); this "
-            f"environment's have the shape {keys['achieved_goal'].shape}."
-        )
+    followed_space(keys["achieved_goal"].shape)
     check_effector(list(settings.effector), keys["observation"])
 
 

@@ -144,7 +144,8 @@ class ReachPolicy(WholeCopies):
         goal = then.next_observations["observation"][:, self.effector].copy()
         steps = later.astype(np.float32)
         to_object = self.rng.random(n) < _TO_OBJECT
-        goal[to_object] = batch.observations["achieved_goal"][to_object]
+        achieved = batch.observations["achieved_goal"][to_object]
+        goal[to_object] = buffer.goal_space.point(achieved)
         steps[to_object] = np.inf
         next_obs = batch.next_observations["observation"]
         distance = np.linalg.norm(next_obs[:, self.effector] - goal, axis=1)

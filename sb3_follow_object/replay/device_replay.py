@@ -235,7 +235,7 @@ class DeviceReplay(WholeCopies):
         if buffer.min_goal_distance > 0.0:
             first = self._flat(episode, th.zeros_like(step))
             origins = buffer.records.fields(self._records)["observations.achieved_goal"]
-            distance = (goal - origins.index_select(0, first)).square().sum(dim=1).sqrt()
+            distance = buffer.goal_space.distance(goal, origins.index_select(0, first))
             virtual &= distance >= buffer.min_goal_distance
 
         desired = th.where(virtual[:, None], goal, fields[DESIRED])

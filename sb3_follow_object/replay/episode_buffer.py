@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..envs.goal_envs import episode_steps
+from ..envs.goal_space import GoalSpace, goal_space
 from ..settings.sizes import check_buffer
 from .episode_table import EpisodeTable
 from .record_buffer import Gathered, RecordReplayBuffer
@@ -27,10 +28,16 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
     step_seconds: float
     min_goal_distance: float
     original_goals: np.ndarray
+    contexts = np.zeros((0, 0, 0), dtype=np.float32)
     _far: np.ndarray
     rng: np.random.Generator
     table: EpisodeTable
     n_added: int
+
+    @property
+    def goal_space(self) -> GoalSpace:
+        """What is known of the environment's goals."""
+        return goal_space(self.observations["desired_goal"].shape[2:])
 
     def add(  # type: ignore[override]
         self,
@@ -74,6 +81,8 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
             self.infos[pos] = infos
         if self.imagined_ratio > 0.0:
             self.original_goals[pos] = [info["original_goal"] for info in infos]
+            if self.contexts.size:
+                self.contexts[pos] = [info["context"] for info in infos]
         self.pos = (pos + 1) % self.buffer_size
         self.full |= self.pos == 0
         self.n_added += 1
@@ -125,20 +134,21 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         origin = self.observations["achieved_goal"][start, env_idx]
         path = self.next_observations["achieved_goal"][slots, env_idx]
         if self.min_goal_distance > 0.0:
-            distance = np.linalg.norm(path - origin, axis=1)
+            distance = self.goal_space.distance(path, origin)
             self._far[slots, env_idx] = distance >= self.min_goal_distance
         self.table.insert(start, env_idx, length, self._priority(origin, path))
 
     def _priority(self, origin: np.ndarray, path: np.ndarray) -> float:
         """Priority of an episode from where the achieved goal began (d,) and went (length, d)."""
-        if np.linalg.norm(path - origin, axis=-1).max() <= self.moved_distance:
+        space = self.goal_space
+        if space.distance(path, origin).max() <= self.moved_distance:
             return 0.0
         if self.moved_priority == "uniform":
             return 1.0
-        moves = np.diff(path, axis=0, prepend=origin[None])
-        speed = np.linalg.norm(moves, axis=-1) / self.step_seconds
-        energy = GRAVITY * path[:, 2] + 0.5 * speed**2  # a unit mass's
-        gains = np.diff(energy, prepend=GRAVITY * origin[2])
+        before = np.concatenate([origin[None], path[:-1]])
+        speed = space.distance(path, before) / self.step_seconds
+        energy = GRAVITY * space.height(path) + 0.5 * speed**2  # a unit mass's
+        gains = np.diff(energy, prepend=GRAVITY * space.height(origin))
         return float(np.clip(gains, 0.0, None).sum())
 
     def _draw(self, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -133,8 +133,10 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
                 f"moved_priority 'energy' reads a height in metres from goals of 3 numbers; these "
                 f"have {goal_shape[-1]}: take 'uniform'"
             )
+        self.n_added = 0  # time-steps so far
         if env is not None:
             self.check_env(env)  # raises now rather than at the first sample
+            self._make_room_for_contexts(env)
         self.rng = np.random.default_rng(
             np.random.randint(2**31) if settings.seed is None else settings.seed
         )
@@ -147,7 +149,6 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         # Whether what a slot achieved is far enough from where its episode began.
         self._far = np.zeros(self.dones.shape if self.min_goal_distance > 0.0 else (0,), dtype=bool)
         self.table = EpisodeTable()
-        self.n_added = 0  # time-steps so far
         self.revision = 0  # counts contents that were loaded over the earlier ones
 
     def set_env(self, env: VecEnv) -> None:
@@ -163,12 +164,26 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         if self.env is not None and env is not self.env:
             self.end_episodes()
         self.env = env
+        if self.n_added == 0:
+            self._make_room_for_contexts(env)
+
+    def _make_room_for_contexts(self, env: VecEnv) -> None:
+        """Let what F_phi sees of other things' places be stored, where it will be asked."""
+        if self.imagined_ratio > 0.0:
+            context = imagination_of(env, IMAGINED_RATIO)[0].context
+            shape = (self.buffer_size, self.n_envs, len(context))
+            self.contexts = np.zeros(shape, dtype=np.float32)
 
     def check_env(self, env: VecEnv) -> None:
         """Raise a ValueError for an environment that `set_env` refuses."""
         check_copies(self.n_envs, env.num_envs)
         if self.imagined_ratio > 0.0:
-            imagination_of(env, IMAGINED_RATIO)
+            n, stored = len(imagination_of(env, IMAGINED_RATIO)[0].context), self.contexts.shape[-1]
+            if self.n_added and n != stored:
+                raise ValueError(
+                    f"the environment's predictor sees {n} numbers of other things' places, but the"
+                    f" replay buffer holds {stored} of each step; give the model a new buffer"
+                )
         asks = self.reward_function is None and self.her_ratio > 0.0
         if asks and not env.has_attr("compute_reward"):
             raise ValueError(
@@ -223,6 +238,8 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         stores = super()._stores()
         if self.imagined_ratio > 0.0:
             stores["original_goals"] = self.original_goals
+            if self.contexts.size:
+                stores["contexts"] = self.contexts
         if self.min_goal_distance > 0.0:
             stores["far"] = self._far
         return stores
@@ -356,7 +373,8 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         start = self.observations["achieved_goal"][first]
         goal = self.original_goals[first]
         level = self.rng.integers(1, curriculum.k_max, size=len(episode), endpoint=True)
-        return imagine(predictor, curriculum, start, goal, level)
+        contexts = self.contexts[first] if self.contexts.size else None
+        return imagine(predictor, curriculum, start, goal, level, contexts)
 
     def _reward(self, achieved: np.ndarray, desired: np.ndarray, flat: np.ndarray) -> np.ndarray:
         """Rewards (n,) of goals achieved for goals desired (n, d) in the transitions `flat`."""

@@ -6,7 +6,7 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
-from ..any_task.tasks import physics_of_task, surface_choices
+from ..any_task.tasks import kept_as, physics_of_task, surface_choices
 from ..common.cache import CACHE_VARIABLE as CACHE_VARIABLE
 from ..common.cache import SET_THE_VARIABLE, cache_folder
 from ..common.files import lock
@@ -60,7 +60,7 @@ def get_object_networks(
 def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report: Report) -> Path:
     """Return a file of a task's first two stages, which run unless it is there already."""
     if folder is None:
-        path = cache_folder() / env_id / physics_of_task(env_id)
+        path = cache_folder() / env_id / kept_as(env_id)
     else:
         path = Path(folder).expanduser()
     if (path / name).exists():  # whole, since files take their names so: reading needs no lock

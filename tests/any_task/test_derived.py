@@ -91,7 +91,29 @@ class NoPhysics(Tidy):
             del self.__dict__["model"], self.__dict__["data"]
 
 
-KINDS = (Tidy, Lifting, Massless, Dense, Posed, NoPhysics)
+class EndsThere(Tidy):
+    """Ends its episodes at the goal."""
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, _, truncated, info = super().step(action)
+        return obs, reward, info["is_success"], truncated, info
+
+
+class EndsOpen(EndsThere):
+    """A drawer is to be opened; the episode ends once it is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.body = "handle"
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        handle, rail = self.data.body("handle").xpos, self.data.joint("rail").xaxis
+        self.goal = handle + rail * self.np_random.uniform(0.05, 0.09)
+        return self._observation(), {}
+
+
+KINDS = (Tidy, Lifting, Massless, Dense, Posed, NoPhysics, EndsThere, EndsOpen)
 for kind in KINDS:
     gym.register(f"{kind.__name__}-v0", kind, max_episode_steps=40, disable_env_checker=True)
 gym.register("Timeless-v0", Tidy, disable_env_checker=True)
@@ -220,7 +242,12 @@ def test_recorded_resets_are_kept_for_the_same_physics(monkeypatch: pytest.Monke
     [
         ("Massless-v0", "'Massless-v0': the object 'mug' has no mass, so nothing can pull it"),
         ("Dense-v0", "'Dense-v0': it pays -?0 on the goal and -17.3205 far from it; the rewards"),
-        ("Posed-v0", r"'Posed-v0': goals must be positions of the shape \(3,\), not \(7,\)"),
+        (
+            "Posed-v0",
+            r"'Posed-v0': the environment's goals have the shape \(7,\); .* positions",
+        ),
+        ("EndsThere-v0", "'EndsThere-v0': it ends its episodes at the goal; imagined goals need"),
+        ("EndsOpen-v0", "'EndsOpen-v0': it ends its episodes at the goal; imagined goals need"),
         ("NoPhysics-v0", "'NoPhysics-v0': NoPhysics holds no MuJoCo simulation"),
         ("Timeless-v0", "'Timeless-v0': it does not say how long its episodes are; register it"),
         ("CartPole-v1", "'CartPole-v1': there are no goals: .*; say with goal= and is_success="),

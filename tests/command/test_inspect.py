@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import arm_and_wall
 import imageio.v3 as imageio
+import moving_wall
 import numpy as np
 import pytest
 
@@ -34,7 +35,7 @@ def test_it_says_what_is_found(capsys: pytest.CaptureFixture[str]) -> None:
     facts = {name: words.strip() for name, words in facts.items()}
     assert facts["object"] == "box (off by 0.00 mm at most; nothing else can move)"
     assert facts["reached"] == "within 50 mm"
-    assert facts["effector"] == "observation[0:3]"
+    assert facts["effector"].startswith("observation[0:3], ")
     assert facts["moves"].startswith("on its surface")
     assert facts["episodes"] == "50 steps; the object's 50"
     assert "where 60 episodes of ArmAndWall-v0 begin is recorded, once" in told.err
@@ -45,6 +46,15 @@ def test_a_goal_as_high_as_the_start_is_no_minus_above_it() -> None:
     resets = SimpleNamespace(starts=starts, goals=starts + np.array([0.3, 0.0, -1e-6]))
     told = inspecting._goal(SimpleNamespace(resets=resets))
     assert told.endswith(" m from the start, 0.00 to 0.00 m above it")
+
+
+def test_it_says_what_stands_elsewhere_and_what_of_it_is_seen(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["inspect", "--env", f"moving_wall:{moving_wall.WALL}"]) == 0
+    told = capsys.readouterr().out
+    expected = "wall (x, y): seen by nu and F_phi; paint, target: need not be seen"
+    assert any(line.split("  ", 1)[1].strip() == expected for line in told.splitlines())
 
 
 def test_it_draws_starts_and_goals(can_draw: None, tmp_path: Path) -> None:

@@ -8,19 +8,25 @@ from typing import Any
 
 import arm_and_wall
 import gymnasium as gym
+import moving_wall
 import numpy as np
 import pytest
 import torch as th
 from gymnasium.wrappers import TimeLimit
 from small_models import weights
 from stable_baselines3.common.callbacks import BaseCallback
-from tiny_runs import TINY, quiet
+from tiny_runs import SMALL_NET, TINY, config, quiet
 
 from sb3_follow_object.any_task import derived as looking
+from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.common.cache import CACHE_VARIABLE
 from sb3_follow_object.follow_object.follow_object import FollowObject
+from sb3_follow_object.follow_object.saved_folder import read
+from sb3_follow_object.imagination.predictor_files import FACTS_FILE
+from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
 from sb3_follow_object.object_stage import stage as stages
 from sb3_follow_object.object_stage.policy import StopWhenSolved
+from sb3_follow_object.runs import predictor_cache
 from sb3_follow_object.settings.presets import run_config
 
 ARM = arm_and_wall.ARM
@@ -117,6 +123,35 @@ def test_an_object_that_does_not_learn_on_its_surface_may_leave_it(
         resumed = again.learn_predictor(state=state)
         assert again.policy_steps == stage.policy_steps
         np.testing.assert_array_equal(resumed.error_mm, predictor.error_mm)
+
+
+def test_a_wall_that_stands_elsewhere_in_each_episode_is_seen_in_all_stages(tmp_path: Path) -> None:
+    replay = {"replay_buffer_kwargs": {"imagined_ratio": 0.5}}
+    settings = {**TINY, "n_envs": 4, "n_threads": 2, "algorithm": {**SMALL_NET, **replay}}
+    run = FollowObject(moving_wall.WALL, **settings).learn(1800)
+    assert run.predictor is not None and run.predictor.context == ("wall x", "wall y")
+    assert run.model is not None and run.model.replay_buffer is not None
+    walls = run.model.replay_buffer.contexts[: run.model.replay_buffer.pos]  # type: ignore[attr-defined]
+    assert len(np.unique(walls[..., 0])) > 4 and 0.3 <= walls[..., 0].min() < walls.max() <= 0.5
+    run.save(tmp_path / "run")
+    assert read(tmp_path / "run").predictor.context == run.predictor.context  # type: ignore[union-attr]
+    run.close()
+
+
+def test_a_predictor_that_is_found_by_itself_sees_the_wall(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(predictor_cache, "run_config", lambda env_id: config(env_id=env_id))
+    env: Any = ImaginedGoalWrapper(gym.make(moving_wall.WALL), curriculum={"p": 0.0})
+    env.load_curriculum(env.curriculum.state_dict())
+    obs, info = env.reset(seed=0)
+    np.testing.assert_allclose(info["context"], env.unwrapped.wall(), atol=1e-12)
+    asked = obs["achieved_goal"][None], info["original_goal"][None], [info["imagined_level"]]
+    shown = env.predictor.predict(*asked[:2], np.array(asked[2]), info["context"][None])
+    np.testing.assert_allclose(obs["desired_goal"], shown[0], atol=1e-6)
+    folder = tmp_path / "cache" / moving_wall.WALL / kept_as(moving_wall.WALL)
+    assert (folder / FACTS_FILE).exists()
+    env.close()
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ class FlatGoals(toy.PointEnv):
     ("make", "message"),
     [
         (lambda: gym.make("Pendulum-v1"), r"lacks \['achieved_goal', 'desired_goal', 'obs"),
-        (FlatGoals, r"shape \(3,\), this environment's goals have the shape \(2,\)"),
+        (FlatGoals, r"goals have the shape \(2,\); .* positions of an object, of the shape \(3,\)"),
         (lambda: without("compute_reward"), "compute_reward"),
         (lambda: without("is_success"), "is_success"),
     ],
@@ -150,6 +150,37 @@ def test_goals_that_move_within_an_episode_are_refused(
     assert sum(1 for _ in play(venv, when - 1)) == (when - 1) * venv.num_envs
     with pytest.raises(ValueError, match=r"goal stays the same within an episode; .* moved"):
         episodes(venv, when)
+
+
+@pytest.mark.parametrize("make", [many, one])
+def test_an_environment_that_ends_at_its_goal_does_so_at_the_original_one(
+    make: Callable[..., VecEnv],
+) -> None:
+    class Ends(toy.PointEnv):
+        def step(self, action: np.ndarray) -> Any:
+            obs, reward, _, truncated, info = super().step(action)
+            return obs, reward, info["is_success"], truncated, info
+
+    venv = make(Ends, k_max=3, sampling="max")
+    obs: Any = venv.reset()
+    goals = np.array([info["original_goal"] for info in venv.reset_infos])
+    early = np.zeros(venv.num_envs, dtype=bool)
+    for _ in range(toy.HORIZON - 1):
+        way = goals - obs["achieved_goal"]
+        way /= np.linalg.norm(way, axis=1, keepdims=True)  # straight, past the goals shown
+        before = obs["desired_goal"]
+        obs, rewards, dones, infos = venv.step(way.astype(np.float32))
+        early |= [info["is_success"] and not done for info, done in zip(infos, dones, strict=True)]
+        for i, info in enumerate(infos):
+            assert dones[i] == info["original_success"]
+            assert rewards[i] == info["is_success"] - 1.0, "paid for the goal shown"
+            if dones[i]:
+                assert not info["TimeLimit.truncated"]
+                shown = info["terminal_observation"]["desired_goal"]
+                np.testing.assert_array_equal(shown, before[i])
+        if dones.any():
+            break
+    assert dones.any() and early.all(), "they went on where the goal shown was reached"
 
 
 def test_observations_and_imagined_goals_of_another_shape_are_refused() -> None:

@@ -79,7 +79,9 @@ class StraightPredictor(GoalPredictor):
     def __init__(self) -> None:
         self.horizon = HORIZON
 
-    def predict(self, start: np.ndarray, goal: np.ndarray, k: np.ndarray) -> np.ndarray:
+    def predict(
+        self, start: np.ndarray, goal: np.ndarray, k: np.ndarray, contexts: Any = None
+    ) -> np.ndarray:
         share = np.minimum(1.0, np.asarray(k) * STEP / REACH)[:, None]
         return (start + share * (goal - start)).astype(np.float64)
 
