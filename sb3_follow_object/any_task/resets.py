@@ -13,8 +13,8 @@ import numpy as np
 from ..common.array_trees import load_tree, save_tree
 from ..envs.goal_space import goal_space
 from ..envs.physics_engine import mujoco
+from ..envs.robot_parts import robot_bodies, standing
 from .physics_access import physics_of
-from .robot_parts import robot_bodies
 
 SURFACE_SHARE, SURFACE_HEIGHT = 0.99, 0.012  # share of the goals, metres off the start's height
 _SAME = 1e-6  # metres, and parts of a unit quaternion
@@ -101,7 +101,7 @@ def record_resets(
 def varying_bodies(model: mujoco.MjModel, resets: Resets) -> frozenset[int]:
     """Bodies that stand still within an episode and elsewhere in another, the robot's left out."""
     spread = np.ptp(resets.places, axis=0).max(axis=1)
-    stands = (model.body_weldid == 0) & ~robot_bodies(model)
+    stands = standing(model) & ~robot_bodies(model)
     return frozenset(int(body) for body in np.flatnonzero(stands & (spread > _SAME)) if body)
 
 

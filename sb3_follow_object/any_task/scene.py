@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ..envs.physics_engine import mujoco
+from ..envs.robot_parts import rigid_group
 from ..envs.scene import weld_to
+from ..envs.transcription import JOINT_SIZE, Transcription, transcribe
 from .resets import Resets, varying_bodies
-from .robot_parts import rigid_group
-from .transcription import JOINT_SIZE, Transcription, transcribe
 
 STEP = 0.04  # seconds of an env step, as in the package's own tasks
 POINT, PULLER = "followed:point", "followed:mocap"
@@ -102,7 +102,7 @@ def object_scene_of(
     copied = transcribe(model, data, varying_bodies(model, resets))
     heavy = _heaviest(model, body)
     spec = copied.spec
-    spec.body(copied.bodies[body]).add_site(name=POINT, pos=offset)
+    copied.added[body].add_site(name=POINT, pos=offset)
     spec.worldbody.add_body(name=PULLER, mocap=True)
     weld_to(spec, PULLER, copied.bodies[heavy])
     alone = spec.compile()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..envs.physics_engine import mujoco
+from .physics_engine import mujoco
 
 _PULLS = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT)
 
@@ -38,8 +38,17 @@ def first_jointed(model: mujoco.MjModel, body: int) -> int:
 
 
 def carrier(model: mujoco.MjModel, body: int) -> int:
-    """The body with the joints that this one is rigidly fixed to, maybe itself; 0, the world."""
-    return int(model.body_weldid[body])
+    """The body with the joints that this one is rigidly fixed to, maybe itself; 0, none has any."""
+    root = int(model.body_weldid[body])
+    return root if model.body_jntnum[root] else 0
+
+
+def standing(model: mujoco.MjModel) -> np.ndarray:
+    """Whether each body has no joint above it, bool (nbody,).
+
+    What a mocap body carries is fixed to the world before MuJoCo 4.0, and to the mocap body since.
+    """
+    return model.body_jntnum[model.body_weldid] == 0
 
 
 def rigid_group(model: mujoco.MjModel, body: int) -> np.ndarray:

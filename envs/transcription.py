@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.physics_engine import mujoco
-from .robot_parts import body_name, robot_bodies, touching_geoms
+from .physics_engine import mujoco
+from .robot_parts import body_name, carrier, robot_bodies, touching_geoms
 
 JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
 _EQUALITIES = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_JOINT)
@@ -25,12 +25,14 @@ class Transcription:
     Attributes:
         spec: not compiled yet; may be added to.
         bodies: body of the model -> name in the spec.
+        added: body of the model -> body of the spec; older MuJoCo finds none by its name.
         joints: joint of the model -> name in the spec.
         standing: bodies that nothing moves within an episode and that are mocap bodies here.
     """
 
     spec: mujoco.MjSpec
     bodies: dict[int, str] = field(default_factory=dict)
+    added: dict[int, Any] = field(default_factory=dict)
     joints: dict[int, str] = field(default_factory=dict)
     standing: list[int] = field(default_factory=list)
 
@@ -101,28 +103,35 @@ def _add_body(
     """Add a body with its inertia and joints; what stands still goes below the world."""
     world = copied.spec.worldbody
     if body == 0:
-        copied.bodies[0] = "world"
+        copied.bodies[0], copied.added[0] = "world", world
         return world
     name = copied.bodies[body] = body_name(model, body)
-    if model.body_weldid[body] == 0:
+    if carrier(model, body) == 0:
         mocap = body in varying or model.body_mocapid[body] >= 0
         added = world.add_body(
             name=name, pos=data.xpos[body], quat=data.xquat[body], mocap=bool(mocap)
         )
+        copied.added[body] = added
+        _copy_inertia(model, body, added)
         if mocap:
             copied.standing.append(body)
         return added
-    parent = copied.spec.body(copied.bodies[int(model.body_parentid[body])])
+    parent = copied.added[int(model.body_parentid[body])]
     added = parent.add_body(name=name, pos=model.body_pos[body], quat=model.body_quat[body])
-    added.explicitinertial = True
-    added.mass = float(model.body_mass[body])
-    added.ipos[:], added.iquat[:] = model.body_ipos[body], model.body_iquat[body]
-    added.inertia[:] = model.body_inertia[body]
+    copied.added[body] = added
+    _copy_inertia(model, body, added)
     added.gravcomp = float(model.body_gravcomp[body])
     first = int(model.body_jntadr[body])
     for joint in range(first, first + int(model.body_jntnum[body])):
         _add_joint(model, joint, added, copied)
     return added
+
+
+def _copy_inertia(model: mujoco.MjModel, body: int, added: Any) -> None:
+    added.explicitinertial = True
+    added.mass = float(model.body_mass[body])
+    added.ipos[:], added.iquat[:] = model.body_ipos[body], model.body_iquat[body]
+    added.inertia[:] = model.body_inertia[body]
 
 
 def _add_joint(model: mujoco.MjModel, joint: int, body: Any, copied: Transcription) -> None:
@@ -176,7 +185,7 @@ def _add_geom(
             "cannot have"
         )
     added = body.add_geom(
-        name=f"geom:{geom}",
+        name=_geom_name(model, geom),
         type=kind,
         pos=model.geom_pos[geom],
         quat=model.geom_quat[geom],
@@ -200,6 +209,10 @@ def _add_geom(
         added.hfieldname = _hfield(model, shape, spec, meshes)
     else:
         added.size[:] = model.geom_size[geom]
+
+
+def _geom_name(model: mujoco.MjModel, geom: int) -> str:
+    return str(model.geom(geom).name) or f"geom:{geom}"
 
 
 def _mesh(
@@ -237,8 +250,8 @@ def _add_contact_rules(model: mujoco.MjModel, copied: Transcription) -> None:
         geoms = [int(model.pair_geom1[pair]), int(model.pair_geom2[pair])]
         if all(int(model.geom_bodyid[geom]) in copied.bodies for geom in geoms):
             copied.spec.add_pair(
-                geomname1=f"geom:{geoms[0]}",
-                geomname2=f"geom:{geoms[1]}",
+                geomname1=_geom_name(model, geoms[0]),
+                geomname2=_geom_name(model, geoms[1]),
                 condim=int(model.pair_dim[pair]),
                 friction=model.pair_friction[pair],
                 solref=model.pair_solref[pair],
