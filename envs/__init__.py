@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from .object_locomotion import ObjectEnv as ObjectEnv
     from .object_locomotion import ObjectVecEnv as ObjectVecEnv
     from .robot_face import RobotTask as RobotTask
-    from .scene import object_only as object_only
 
 _HOME = {
     "FetchEnv": "fetch",
@@ -29,7 +28,6 @@ _HOME = {
     "ObjectVecEnv": "object_locomotion",
     "RobotTask": "robot_face",
     "make_vec": "make",
-    "object_only": "scene",
     "object_state": "fetch",
     "physics_id": "make",
 }

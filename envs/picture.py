@@ -12,7 +12,7 @@ import numpy as np
 from .batch import BatchedSimulation
 from .graphics import check_windows, open_graphics
 from .physics_engine import mujoco
-from .scene import OBJECT, OBSTACLE, TUBE, Scene, delete, fetch_spec, object_only
+from .scene import OBJECT, OBSTACLE, PULLER, TUBE, Scene, delete, fetch_spec
 from .tasks import SUCCESS_DISTANCE, Region, reference_point
 
 SIZE = 480  # pixels, both ways
@@ -22,6 +22,7 @@ _LOOK_AT = (1.3, 0.75, 0.54)
 _DISTANCE, _AZIMUTH, _ELEVATION = 1.4, 183.0, -32.0
 _BACKGROUND = ((0.98, 0.98, 0.99), (0.85, 0.88, 0.93))  # the sky's two colours
 _OBSTACLE_ALPHA = 0.5  # what is in or behind them is seen through them
+_ROBOT = "robot0:"  # what its bodies are called
 _ROBOT_ALPHA = 0.3  # while markers are shown, which may stand behind it
 _OBJECT_RGBA = (0.95, 0.65, 0.1, 1.0)
 _GOAL_RGBA = (0.9, 0.1, 0.1, 0.8)
@@ -166,7 +167,7 @@ class _Canvas:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._pen)
         self.scene = mujoco.MjvScene(model, maxgeom=2000)
         bodies = [model.body(body).name for body in model.geom_bodyid]
-        self._of_robot = np.array([name.startswith("robot0:") for name in bodies])
+        self._of_robot = np.array([name.startswith(_ROBOT) for name in bodies])
         _point(self._camera)
 
     def show(self, simulation: BatchedSimulation, index: int, see_through: bool) -> None:
@@ -233,7 +234,13 @@ def whole_model(scene: Scene) -> mujoco.MjModel:
     for texture in spec.textures:
         if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             texture.rgb1, texture.rgb2 = _BACKGROUND
-    return (object_only(spec, OBJECT) if scene.alone else spec).compile()
+    if scene.alone:
+        for group in (spec.keys, spec.sensors, spec.actuators, spec.tendons, spec.equalities):
+            delete(spec, group)
+        delete(spec, spec.excludes)
+        delete(spec, (body for body in spec.worldbody.bodies if body.name.startswith(_ROBOT)))
+        spec.worldbody.add_body(name=PULLER, mocap=True)
+    return spec.compile()
 
 
 def _copy_state(

@@ -18,12 +18,14 @@ import numpy as np
 
 from .physics_engine import mujoco
 from .tasks import SUCCESS_DISTANCE, Box, Landmarks, Task
+from .transcription import transcribe
 
 N_SUBSTEPS = 20  # of 0.002 s each: one env step is 0.04 s
 OBJECT = "object0"  # body, site and geom
 TABLE = "table0"
 TUBE = "tube"
 OBSTACLE = "obstacle"
+PULLER = f"{OBJECT}:mocap"  # pulls the object where it is alone
 GRIP_SITE = "robot0:grip"
 # Right, then left, as in the observation.
 FINGER_JOINTS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
@@ -121,10 +123,22 @@ def fetch_scene(task: Task, collision: str = "reachable") -> Scene:
 def object_scene(task: Task) -> Scene:
     """The same task with the object alone; episodes start as those of the robot do."""
     robot = fetch_scene(task)
-    model = strip_visuals(object_only(fetch_spec(task), OBJECT)).compile()
+    model = _object_alone(fetch_spec(task).compile())
     start = robot.model.joint(f"{OBJECT}:joint").qposadr[0]
     qpos = robot.qpos[start : start + 7].copy()
     return Scene(task, True, model, qpos, np.zeros(model.nv), 0.0, robot.landmarks)
+
+
+def _object_alone(whole: mujoco.MjModel) -> mujoco.MjModel:
+    """The passive part of a scene, its object pulled by a mocap body (section 4.1)."""
+    data = mujoco.MjData(whole)
+    mujoco.mj_kinematics(whole, data)
+    copied = transcribe(whole, data)
+    thing = copied.added[int(whole.body(OBJECT).id)]
+    thing.add_site(name=OBJECT, pos=whole.site(OBJECT).pos)
+    copied.spec.worldbody.add_body(name=PULLER, mocap=True, pos=thing.pos, quat=thing.quat)
+    weld_to(copied.spec, PULLER, OBJECT)
+    return copied.spec.compile()
 
 
 def fetch_spec(task: Task) -> mujoco.MjSpec:
@@ -138,51 +152,6 @@ def fetch_spec(task: Task) -> mujoco.MjSpec:
     if task.tube:
         tube = spec.worldbody.add_body(name=TUBE, mocap=True, pos=_TUBE_STORE)
         _add_boxes(tube, TUBE, task.tube)
-    return spec
-
-
-def object_only(spec: mujoco.MjSpec, body_name: str) -> mujoco.MjSpec:
-    """A scene with one free body and without the robot: the body is welded to a new mocap body.
-
-    What stands still stays, other free bodies too. Articulated bodies and the mocap bodies that
-    pull them go, and with them actuators, sensors, tendons, equalities, keyframes (section 4.1).
-
-    Args:
-        spec: any scene; it is not changed.
-        body_name: the free body to keep.
-
-    Returns:
-        A new spec whose mocap body is called `<body_name>:mocap`.
-
-    Raises:
-        ValueError: there is no such body or it has no free joint.
-    """
-    spec = spec.copy()
-    names = [body.name for body in spec.bodies]
-    if body_name not in names:
-        known = ", ".join(name for name in names if name)
-        raise ValueError(f"The scene has no body {body_name!r}; its bodies are {known}.")
-    body = _child(spec.bodies, body_name)
-    if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints):
-        raise ValueError(f"Body {body_name!r} has no free joint, so it cannot move by itself.")
-
-    welded = {name for eq in spec.equalities for name in (eq.name1, eq.name2)}
-    gone = [
-        child
-        for child in spec.worldbody.bodies
-        if child.name != body_name
-        and (_articulated(child) or (child.mocap and child.name in welded))
-    ]
-    gone_names = {name for child in gone for name in _names_below(child)}
-    for group in (spec.keys, spec.sensors, spec.actuators, spec.tendons, spec.equalities):
-        delete(spec, group)
-    delete(spec, (x for x in spec.excludes if {x.bodyname1, x.bodyname2} & gone_names))
-    delete(spec, (x for x in spec.pairs if {x.geomname1, x.geomname2} & gone_names))
-    delete(spec, gone)
-
-    mocap = f"{body_name}:mocap"
-    spec.worldbody.add_body(name=mocap, mocap=True, pos=body.pos, quat=body.quat)
-    weld_to(spec, mocap, body_name)
     return spec
 
 
@@ -301,12 +270,6 @@ def _child(bodies: Iterable[Any], name: str) -> Any:
     return next(body for body in bodies if body.name == name)
 
 
-def _articulated(body: Any) -> bool:
-    """Whether a body or one below it has a joint other than a free one."""
-    hinged = any(joint.type != mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
-    return hinged or any(_articulated(child) for child in body.bodies)
-
-
 def _delete_empty(spec: mujoco.MjSpec, body: Any) -> bool:
     """Delete the bodies from here down that hold nothing; whether this one was one of them."""
     kept = [child for child in list(body.bodies) if not _delete_empty(spec, child)]
@@ -315,12 +278,6 @@ def _delete_empty(spec: mujoco.MjSpec, body: Any) -> bool:
         return False
     delete(spec, [body])
     return True
-
-
-def _names_below(body: Any) -> set[str]:
-    """Names of a body, its geoms, and all below it."""
-    names = {body.name, *(geom.name for geom in body.geoms)}
-    return names.union(*(_names_below(child) for child in body.bodies))
 
 
 def delete(spec: mujoco.MjSpec, elements: Iterable[Any]) -> None:

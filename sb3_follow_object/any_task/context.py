@@ -12,9 +12,9 @@ import gymnasium as gym
 import numpy as np
 
 from ..envs.physics_engine import mujoco
+from ..envs.robot_parts import body_name, rigid_group, robot_bodies, touching_geoms
 from .physics_access import physics_of
 from .resets import Resets
-from .robot_parts import body_name, rigid_group, robot_bodies, touching_geoms
 
 # Position in metres, then the directions of the body's x and y axis.
 NUMBERS = ("x", "y", "z", "xx", "xy", "xz", "yx", "yy", "yz")

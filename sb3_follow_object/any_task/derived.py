@@ -19,11 +19,11 @@ from ..envs.physics_engine import mujoco
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
 from ..envs.robot_face import RobotTask, rewards_on_and_off
+from ..envs.robot_parts import body_name
 from .context import context_of
 from .finding import Candidate, Effector, Observed, candidates, find_effector, find_object, observe
 from .physics_access import physics_of
 from .resets import Resets, record_resets, varying_bodies
-from .robot_parts import body_name
 from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of
 
 N_RESETS = 2000  # episodes that are recorded; of a hundred F_phi does not learn the places between

@@ -8,8 +8,8 @@ import gymnasium as gym
 import numpy as np
 
 from ..envs.physics_engine import mujoco
+from ..envs.robot_parts import body_name, carrier, robot_bodies, touching_geoms
 from .physics_access import physics_of
-from .robot_parts import body_name, carrier, robot_bodies, touching_geoms
 
 N_RESETS, N_STEPS = 20, 30  # watched, the steps after one reset at random
 TOLERANCE = 1e-3  # metres that a body's fixed point may lie off the achieved goal

@@ -13,8 +13,8 @@ import numpy as np
 from ..common.array_trees import load_tree, save_tree
 from ..envs.goal_space import goal_space
 from ..envs.physics_engine import mujoco
+from ..envs.robot_parts import robot_bodies, standing
 from .physics_access import physics_of
-from .robot_parts import robot_bodies, standing
 
 SURFACE_SHARE, SURFACE_HEIGHT = 0.99, 0.012  # share of the goals, metres off the start's height
 _SAME = 1e-6  # metres, and parts of a unit quaternion

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ..envs.physics_engine import mujoco
+from ..envs.robot_parts import rigid_group
 from ..envs.scene import weld_to
+from ..envs.transcription import JOINT_SIZE, Transcription, transcribe
 from .resets import Resets, varying_bodies
-from .robot_parts import rigid_group
-from .transcription import JOINT_SIZE, Transcription, transcribe
 
 STEP = 0.04  # seconds of an env step, as in the package's own tasks
 POINT, PULLER = "followed:point", "followed:mocap"

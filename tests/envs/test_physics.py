@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from sb3_follow_object.envs import TASKS, FetchEnv, ObjectEnv, Region, Task, object_only
-from sb3_follow_object.envs.scene import fetch_scene, fetch_spec
+from sb3_follow_object.envs import TASKS, FetchEnv, ObjectEnv, Region, Task
+from sb3_follow_object.envs.scene import PULLER, fetch_scene, fetch_spec, object_scene
 
 AROUND_GRIPPER = Region("gripper", (-0.15, -0.15), (0.15, 0.15))
 BLOCKED = Task("Blocked", AROUND_GRIPPER, AROUND_GRIPPER, blocked_gripper=True)
@@ -123,44 +123,26 @@ def test_the_tube_stands_at_the_goal_and_leaves_room_for_the_object() -> None:
         assert not walls & touched
 
 
-USER_SCENE = """
-<mujoco>
-  <worldbody>
-    <geom name="ground" type="plane" size="1 1 1"/>
-    <body name="shelf" pos="0 0.4 0.1"><geom name="shelf" type="box" size="0.1 0.1 0.1"/></body>
-    <body name="hand" mocap="true" pos="0 0 1"/>
-    <body name="arm" pos="0 0 1">
-      <joint name="hinge" axis="0 1 0"/>
-      <geom name="arm" type="capsule" size="0.02 0.1"/>
-    </body>
-    <body name="mug" pos="0.1 0 0.05"><freejoint/><geom name="mug" size="0.05" mass="0.2"/></body>
-    <body name="cup" pos="0.4 0 0.05"><freejoint/><geom name="cup" size="0.05" mass="0.2"/></body>
-  </worldbody>
-  <equality><weld body1="hand" body2="arm"/></equality>
-  <contact><exclude body1="arm" body2="mug"/></contact>
-  <actuator><motor joint="hinge"/></actuator>
-  <sensor><jointpos joint="hinge"/></sensor>
-</mujoco>
-"""
-
-
-def test_object_only_drops_the_robot_of_any_scene() -> None:
-    spec = mujoco.MjSpec.from_string(USER_SCENE)
-    model = object_only(spec, "mug").compile()
-    bodies = {model.body(index).name for index in range(model.nbody)}
-    assert bodies == {"world", "shelf", "mug", "cup", "mug:mocap"}
-    assert (model.nu, model.nsensor, model.nexclude, model.neq) == (0, 0, 0, 1)
-    data = mujoco.MjData(model)
-    data.mocap_pos[0] = [0.1, 0.0, 0.3]
-    mujoco.mj_step(model, data, nstep=500)
-    np.testing.assert_allclose(data.body("mug").xpos, [0.1, 0.0, 0.3], atol=1e-3)
-    assert spec.compile().nu == 1  # the scene that was given is as it was
-
-
-@pytest.mark.parametrize(("name", "message"), [("jug", "no body 'jug'"), ("arm", "no free joint")])
-def test_object_only_refuses_in_a_sentence(name: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        object_only(mujoco.MjSpec.from_string(USER_SCENE), name)
+@pytest.mark.parametrize("name", TASKS)
+def test_the_object_is_alone_with_what_stands_and_what_pulls_it(name: str) -> None:
+    whole, alone = fetch_scene(TASKS[name]).model, object_scene(TASKS[name]).model
+    kept = {whole.body(body).name for body in range(whole.nbody)}
+    kept = {body for body in kept if not body.startswith("robot0:")}
+    assert {alone.body(body).name for body in range(alone.nbody)} == {*kept, PULLER}
+    assert (alone.nv, alone.nu, alone.neq) == (6, 0, 1)
+    for body in kept:
+        for field in ("pos", "mass", "inertia", "ipos", "iquat"):
+            ours, theirs = (getattr(model.body(body), field) for model in (alone, whole))
+            np.testing.assert_array_equal(ours, theirs, err_msg=f"{body} {field}")
+    whole_geoms, geoms = (
+        sorted(
+            (model.body(model.geom_bodyid[g]).name, *model.geom_pos[g], *model.geom_size[g])
+            for g in range(model.ngeom)
+            if model.body(model.geom_bodyid[g]).name in kept
+        )
+        for model in (whole, alone)
+    )
+    assert geoms == whole_geoms
 
 
 def test_the_trimmed_model_keeps_masses_joints_and_inertias() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.physics_engine import mujoco
+from .physics_engine import mujoco
 from .robot_parts import body_name, carrier, robot_bodies, touching_geoms
 
 JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
@@ -112,21 +112,26 @@ def _add_body(
             name=name, pos=data.xpos[body], quat=data.xquat[body], mocap=bool(mocap)
         )
         copied.added[body] = added
+        _copy_inertia(model, body, added)
         if mocap:
             copied.standing.append(body)
         return added
     parent = copied.added[int(model.body_parentid[body])]
     added = parent.add_body(name=name, pos=model.body_pos[body], quat=model.body_quat[body])
     copied.added[body] = added
-    added.explicitinertial = True
-    added.mass = float(model.body_mass[body])
-    added.ipos[:], added.iquat[:] = model.body_ipos[body], model.body_iquat[body]
-    added.inertia[:] = model.body_inertia[body]
+    _copy_inertia(model, body, added)
     added.gravcomp = float(model.body_gravcomp[body])
     first = int(model.body_jntadr[body])
     for joint in range(first, first + int(model.body_jntnum[body])):
         _add_joint(model, joint, added, copied)
     return added
+
+
+def _copy_inertia(model: mujoco.MjModel, body: int, added: Any) -> None:
+    added.explicitinertial = True
+    added.mass = float(model.body_mass[body])
+    added.ipos[:], added.iquat[:] = model.body_ipos[body], model.body_iquat[body]
+    added.inertia[:] = model.body_inertia[body]
 
 
 def _add_joint(model: mujoco.MjModel, joint: int, body: Any, copied: Transcription) -> None:
@@ -180,7 +185,7 @@ def _add_geom(
             "cannot have"
         )
     added = body.add_geom(
-        name=f"geom:{geom}",
+        name=_geom_name(model, geom),
         type=kind,
         pos=model.geom_pos[geom],
         quat=model.geom_quat[geom],
@@ -204,6 +209,10 @@ def _add_geom(
         added.hfieldname = _hfield(model, shape, spec, meshes)
     else:
         added.size[:] = model.geom_size[geom]
+
+
+def _geom_name(model: mujoco.MjModel, geom: int) -> str:
+    return str(model.geom(geom).name) or f"geom:{geom}"
 
 
 def _mesh(
@@ -241,8 +250,8 @@ def _add_contact_rules(model: mujoco.MjModel, copied: Transcription) -> None:
         geoms = [int(model.pair_geom1[pair]), int(model.pair_geom2[pair])]
         if all(int(model.geom_bodyid[geom]) in copied.bodies for geom in geoms):
             copied.spec.add_pair(
-                geomname1=f"geom:{geoms[0]}",
-                geomname2=f"geom:{geoms[1]}",
+                geomname1=_geom_name(model, geoms[0]),
+                geomname2=_geom_name(model, geoms[1]),
                 condim=int(model.pair_dim[pair]),
                 friction=model.pair_friction[pair],
                 solref=model.pair_solref[pair],

@@ -10,11 +10,11 @@ import pytest
 from scenes import kitchen, throw
 
 from sb3_follow_object.any_task.physics_access import physics_of
-from sb3_follow_object.any_task.robot_parts import body_name, carrier, robot_bodies, standing
 from sb3_follow_object.any_task.scene import PULLER
-from sb3_follow_object.any_task.transcription import transcribe
 from sb3_follow_object.envs.registration import import_task
+from sb3_follow_object.envs.robot_parts import body_name, carrier, robot_bodies, standing
 from sb3_follow_object.envs.scene import weld_to
+from sb3_follow_object.envs.transcription import transcribe
 
 TENTH_OF_MM = 1e-4
 SECONDS = 0.6
@@ -130,7 +130,7 @@ def test_what_stands_elsewhere_in_each_episode_becomes_a_mocap_body() -> None:
     alone, state = passive(model, data, frozenset([shelf]))
     assert alone.body("shelf").mocapid[0] >= 0 > alone.body("bench").mocapid[0]
     np.testing.assert_allclose(alone.body("bench").pos, data.xpos[bench])
-    top = "geom:1"
+    top = "top"
     mocap = int(alone.body("shelf").mocapid[0])
     state.mocap_pos[mocap] = (0.45, 0.05, 0.23)  # under the mug
     mujoco.mj_forward(alone, state)
