@@ -5,7 +5,7 @@
 A run takes the place of one of the same task, method and seed. Its policy, configuration, versions
 and learning curve are copied: `sb3-follow-object evaluate benchmarks/results/<run>` tests it again;
 runs of benchmarks/stock_sb3.py have no policy file. Everything else is made of the copied
-runs: summary.csv, the tables of README and of docs/results.md (medians over seeds), the figures.
+runs: summary.csv, the table of docs/results.md (medians over seeds), the figures.
 """
 
 from __future__ import annotations
@@ -22,11 +22,9 @@ from sb3_follow_object.comparison.cross import CROSS_TESTS
 from sb3_follow_object.comparison.figures import draw_results
 from sb3_follow_object.comparison.plots import draw_curves
 from sb3_follow_object.comparison.results import read_results, write_tables
-from sb3_follow_object.envs import TASKS
 
 RESULTS = Path(__file__).parent / "results"
-ROOT = Path(__file__).parents[1]
-README, PAGE = ROOT / "README.md", ROOT / "docs" / "results.md"
+PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 BEGIN, END = "<!-- results: python benchmarks/collect.py -->\n", "<!-- end of results -->"
 COLUMNS = (
     "task",
@@ -91,27 +89,15 @@ def full_table(rows: Rows) -> str:
     return "\n".join(lines) + "\n"
 
 
-def small_table(rows: Rows) -> str:
-    """Return FO beside HER as a Markdown table, a line for each of the paper's tasks."""
-    lines = ["| task | env steps | minutes | FO | HER |", "|---|---|---|---|---|"]
-    for task in TASKS:
-        fo, her = ([r for r in rows if (r["task"], r["method"]) == (task, m)] for m in FO_AND_HER)
-        steps, minutes = middle(fo, "env_steps"), middle(fo, "wall_s") / 60
-        rates = [f"{middle(runs, 'success_rate'):.2f}" if runs else "not run" for runs in (fo, her)]
-        lines.append(f"| {task} | {steps:,.0f} | {minutes:.0f} | {' | '.join(rates)} |")
-    return "\n".join(lines) + "\n"
-
-
 def with_table(text: str, table: str) -> str:
     """Return a page with the table between its marks written anew."""
     head, rest = text.split(BEGIN)
     return head + BEGIN + table + END + rest.split(END)[1]
 
 
-def write_pages(rows: Rows) -> None:
-    """Write the tables of README and of the docs."""
-    for page, table in ((README, small_table(rows)), (PAGE, full_table(rows))):
-        page.write_text(with_table(page.read_text(), table))
+def write_page(rows: Rows) -> None:
+    """Write the table of the docs."""
+    PAGE.write_text(with_table(PAGE.read_text(), full_table(rows)))
 
 
 def main() -> None:
@@ -140,7 +126,7 @@ def main() -> None:
         wanted = [row for row in ordered if row["task"] == task and row["method"] in FO_AND_HER]
         folders = [RESULTS / "-".join((r["task"], r["method"], r["seed"])) for r in wanted]
         draw_curves(folders, RESULTS / name)
-    write_pages(ordered)
+    write_page(ordered)
     print(f"{len(ordered)} rows in {summary}")
 
 

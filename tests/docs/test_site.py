@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import json
 import re
 import sys
 from pathlib import Path
@@ -83,24 +84,30 @@ def test_every_task_has_its_row_with_the_steps_of_its_preset() -> None:
     }
 
 
-@pytest.fixture(scope="module")
-def collect() -> ModuleType:
-    """benchmarks/collect.py, which is no part of the package."""
-    spec = importlib.util.spec_from_file_location("collect", ROOT / "benchmarks" / "collect.py")
+def benchmark(name: str) -> ModuleType:
+    """A script of benchmarks/, which are no part of the package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-def test_tables_of_results_are_the_collected_ones(collect: ModuleType) -> None:
+def test_the_table_of_results_is_the_collected_one() -> None:
+    collect = benchmark("collect")
     with open(collect.RESULTS / "summary.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+        table = collect.full_table(list(csv.DictReader(file)))
+    assert collect.with_table(collect.PAGE.read_text(), table) == collect.PAGE.read_text()
+
+
+def test_the_tables_of_the_recipe_are_the_kept_ones() -> None:
+    recipe = benchmark("recipe")
+    rows = json.loads((recipe.KEPT / "runs.json").read_text())
     for page, table in (
-        (collect.README, collect.small_table(rows)),
-        (collect.PAGE, collect.full_table(rows)),
+        (recipe.README, recipe.small_table(rows)),
+        (recipe.PAGE, recipe.full_table(rows)),
     ):
-        assert collect.with_table(page.read_text(), table) == page.read_text()
+        assert recipe.with_table(page.read_text(), table) == page.read_text()
 
 
 def test_readme_is_a_page() -> None:
