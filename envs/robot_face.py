@@ -72,9 +72,9 @@ class RobotTask(gym.Wrapper):
                 "goal= and is_success= what is achieved, what is desired and when that is reached"
             )
         if effector is not None:
+            n = spaces.flatdim(cast(spaces.Dict, self.observation_space)["observation"])
+            self.told_effector = n, n + 1, n + 2
             self.observation_space = _with_effector(self.observation_space)
-            n = self.observation_space["observation"].shape[0]
-            self.told_effector = n - 3, n - 2, n - 1
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
