@@ -234,9 +234,9 @@ def _with_effector(space: spaces.Space) -> spaces.Dict:
     """The space of observations that end with a position."""
     keys = dict(cast(spaces.Dict, space).spaces)
     box = cast(spaces.Box, keys["observation"])
-    anywhere = np.full(POSITION, np.inf)
-    low, high = np.append(box.low, -anywhere), np.append(box.high, anywhere)
     kind: Any = box.dtype
+    anywhere = np.full(POSITION, np.inf, dtype=kind)
+    low, high = np.append(box.low, -anywhere), np.append(box.high, anywhere)
     return spaces.Dict({**keys, "observation": spaces.Box(low, high, dtype=kind)})
 
 
