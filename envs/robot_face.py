@@ -72,9 +72,9 @@ class RobotTask(gym.Wrapper):
                 "goal= and is_success= what is achieved, what is desired and when that is reached"
             )
         if effector is not None:
+            n = spaces.flatdim(cast(spaces.Dict, self.observation_space)["observation"])
+            self.told_effector = n, n + 1, n + 2
             self.observation_space = _with_effector(self.observation_space)
-            (n,) = cast(spaces.Box, self.observation_space["observation"]).shape
-            self.told_effector = n - 3, n - 2, n - 1
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -234,9 +234,9 @@ def _with_effector(space: spaces.Space) -> spaces.Dict:
     """The space of observations that end with a position."""
     keys = dict(cast(spaces.Dict, space).spaces)
     box = cast(spaces.Box, keys["observation"])
-    anywhere = np.full(POSITIONS.size, np.inf)
-    low, high = np.append(box.low, -anywhere), np.append(box.high, anywhere)
     kind: Any = box.dtype
+    anywhere = np.full(POSITIONS.size, np.inf, dtype=kind)
+    low, high = np.append(box.low, -anywhere), np.append(box.high, anywhere)
     return spaces.Dict({**keys, "observation": spaces.Box(low, high, dtype=kind)})
 
 

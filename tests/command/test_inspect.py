@@ -35,7 +35,7 @@ def test_it_says_what_is_found(capsys: pytest.CaptureFixture[str]) -> None:
     facts = {name: words.strip() for name, words in facts.items()}
     assert facts["object"] == "box (off by 0.00 mm at most; nothing else can move)"
     assert facts["reached"] == "within 50 mm"
-    assert facts["effector"].startswith("observation[0:3], ")
+    assert facts["effector"] == "observation[0:3], 2 mm off the fingertips' middle"
     assert facts["moves"].startswith("on its surface")
     assert facts["episodes"] == "50 steps; the object's 50"
     assert "where 60 episodes of ArmAndWall-v0 begin is recorded, once" in told.err
