@@ -32,11 +32,13 @@ class BentPredictor(toy.StraightPredictor):
     def __init__(self) -> None:
         self.horizon = HORIZON
 
-    def paths(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    def paths(self, start: np.ndarray, goal: np.ndarray, contexts: Any = None) -> np.ndarray:
         way = np.linspace(0.0, 0.5, HORIZON + 1)[None, :, None] * np.array([1.0, 0.0, 0.0])
         return np.asarray(start)[:, None] + way
 
-    def predict(self, start: np.ndarray, goal: np.ndarray, k: np.ndarray) -> np.ndarray:
+    def predict(
+        self, start: np.ndarray, goal: np.ndarray, k: np.ndarray, contexts: Any = None
+    ) -> np.ndarray:
         return self.paths(start, goal)[np.arange(len(k)), k]
 
 
@@ -322,7 +324,7 @@ class SwitchEnv(ReachToyEnv):
     ("env", "settings", "sentence"),
     [
         (FlatEnv, {}, r"needs Dict goal observations; this environment lacks \['achieved_goal'"),
-        (PlanarEnv, {}, r"positions of shape \(3,\); this environment's have the shape \(2,\)"),
+        (PlanarEnv, {}, r"goals have the shape \(2,\); what can be followed are positions"),
         (SwitchEnv, {}, r"needs actions in a Box; this environment's are Discrete\(4\)"),
         (ReachToyEnv, {"effector": (4, 5, 6)}, r"effector is \[4, 5, 6\].*must hold"),
         (ReachToyEnv, {"effector": (1, 2)}, "effector must be three whole numbers"),
