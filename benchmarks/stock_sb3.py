@@ -56,9 +56,9 @@ def train(options: argparse.Namespace) -> float:
     return time.monotonic() - began
 
 
-def object_steps(run: Path) -> int:
-    """Return the env steps of the object's stage, 0 where there was none."""
-    told = re.findall(r"^ +(\d+) env steps", (run / "train.log").read_text(), re.MULTILINE)
+def last_told(run: Path, pattern: str) -> int:
+    """Return the last number that the training's log says so, 0 where it does not."""
+    told = re.findall(pattern, (run / "train.log").read_text(), re.MULTILINE)
     return int(told[-1]) if told else 0
 
 
@@ -90,7 +90,7 @@ def validations(folder: Path, before: int) -> list[tuple[int, float]]:
 def result(options: argparse.Namespace, seconds: float) -> dict[str, Any]:
     """Return what result.json holds, after writing the validations."""
     (folder,) = (options.run / "logs" / options.algo).iterdir()
-    before = object_steps(options.run)
+    before = last_told(options.run, r"^ +(\d+) env steps")
     with open(options.run / "evaluations.csv", "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("env_steps", "success_rate", "episodes"))
@@ -102,7 +102,7 @@ def result(options: argparse.Namespace, seconds: float) -> dict[str, Any]:
         "seed": options.seed,
         "env_steps": model.num_timesteps + before,
         "object_steps": before,
-        "test_steps": getattr(model, "curriculum_test_steps", ""),
+        "test_steps": last_told(options.run, r"test_steps +\| (\d+)"),
         "wall_s": round(seconds, 1),
         "success_rate": episodes.success_rate,
         "episodes": len(episodes.success),
