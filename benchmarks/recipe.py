@@ -88,9 +88,16 @@ def in_the_end(row: dict[str, Any]) -> str:
     return f"{row['success_rate']:.2f} at {row['env_steps']:,}{itself}"
 
 
+def is_before(run: Path) -> bool:
+    """Whether a run is one of before 0.2.0."""
+    versions = json.loads((run / "versions.json").read_text())
+    return bool(versions["sb3-follow-object"] == "0.1.0")
+
+
 def earlier(task: str) -> str:
     """Return after how many env steps FO was good enough before 0.2.0, seed by seed."""
-    found = [first_good(file) for file in sorted(BEFORE.glob(f"{task}-fo-[0-9]*/evaluations.csv"))]
+    runs = (run for run in sorted(BEFORE.glob(f"{task}-fo-[0-9]*")) if is_before(run))
+    found = [first_good(run / "evaluations.csv") for run in runs]
     return ", ".join(f"{int(good['env_steps']):,}" for good in found if good)
 
 
