@@ -7,21 +7,22 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.td3.policies import Actor, TD3Policy
+from stable_baselines3.td3.policies import Actor, MultiInputPolicy
 
 from ..common.torch_helpers import WholeModule, usual_defaults
 from ..settings.learning import GoalPolicySettings
-from .policies import LayerNormCritic
+from .policies import LayerNormCritic, with_fused_adam
 
 
-class GoalPolicy(WholeModule, TD3Policy):
-    """TD3Policy whose critic neither overestimates without end nor drives actions to their limits.
+class GoalPolicy(WholeModule, MultiInputPolicy):
+    """TD3's MultiInputPolicy whose critic has bounds and whose actor pays for large actions.
 
-    Stock algorithms have no setting for the three things that `HerDDPG` does about that, so they
-    are in the networks: LayerNorm in the critics, targets within the returns that rewards can sum
-    up to, and a price on large actions. Inputs are left to VecNormalize.
+    Stock algorithms have no setting for the three things that `HerDDPG` does about values that run
+    away and actions that stick to their limits, so they are in the networks: LayerNorm in the
+    critics, targets within the returns that rewards can sum up to, and a price on large actions.
+    Inputs are left to VecNormalize.
 
     Args:
         action_l2: weight, >= 0, of the mean squared action in the actor's loss; it comes in with
@@ -29,7 +30,7 @@ class GoalPolicy(WholeModule, TD3Policy):
         target_clip: (low, high), bounds of what the target critic says; for rewards of -1 and 0
             they are -1/(1 - gamma) and 0. None, none.
 
-    The other arguments are TD3Policy's.
+    The other arguments are MultiInputPolicy's; net_arch is three layers of 256 by default.
 
     Raises:
         ValueError: an argument outside its range.
@@ -37,31 +38,19 @@ class GoalPolicy(WholeModule, TD3Policy):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Dict,
         action_space: spaces.Box,
         lr_schedule: Schedule,
-        net_arch: list[int] | dict[str, list[int]] | None = None,
         action_l2: float = GoalPolicySettings.action_l2,
         target_clip: tuple[float, float] | None = GoalPolicySettings.target_clip,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
-        optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
         settings = GoalPolicySettings(action_l2=action_l2, target_clip=target_clip)
-        if kwargs.get("optimizer_class", th.optim.Adam) in (th.optim.Adam, th.optim.AdamW):
-            optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         self.action_l2 = settings.action_l2
         self.target_clip = settings.target_clip
+        kwargs = {"net_arch": [256, 256, 256], **with_fused_adam(kwargs)}
         with usual_defaults():
-            super().__init__(
-                observation_space,
-                action_space,
-                lr_schedule,
-                net_arch=[256, 256, 256] if net_arch is None else net_arch,
-                features_extractor_class=features_extractor_class,
-                optimizer_kwargs=optimizer_kwargs,
-                **kwargs,
-            )
+            super().__init__(observation_space, action_space, lr_schedule, **kwargs)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {"action_l2": self.action_l2, "target_clip": self.target_clip}

@@ -30,8 +30,7 @@ class LayerNorm(nn.LayerNorm):
 class LayerNormReLU(nn.Module):
     """ReLU of standardised inputs: brings LayerNorm into any network of SB3, as its activation_fn.
 
-    It has no weights, so it needs no widths: SB3 makes activations without arguments. Sparse
-    rewards let critics overestimate without end where nothing holds them; this does.
+    It has no weights, so it needs no widths: SB3 makes activations without arguments.
     """
 
     def forward(self, x: th.Tensor) -> th.Tensor:

@@ -65,6 +65,16 @@ class LayerNormCritic(ContinuousCritic):
             self.q_networks[idx] = q_net
 
 
+def with_fused_adam(kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Return a policy's arguments with one kernel for all parameters, where its optimiser has it.
+
+    An update is memory-bound otherwise.
+    """
+    if kwargs.get("optimizer_class", th.optim.Adam) not in (th.optim.Adam, th.optim.AdamW):
+        return kwargs
+    return {**kwargs, "optimizer_kwargs": {"fused": True, **(kwargs.get("optimizer_kwargs") or {})}}
+
+
 class HerPolicy(WholeModule, TD3Policy):
     """Actor and critics of three layers of 256 on normalised observations and goals.
 
@@ -86,12 +96,8 @@ class HerPolicy(WholeModule, TD3Policy):
         net_arch: list[int] | dict[str, list[int]] | None = None,
         critic_layer_norm: bool = PolicySettings.critic_layer_norm,
         features_clip: float = PolicySettings.features_clip,
-        optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
-        if kwargs.get("optimizer_class", th.optim.Adam) in (th.optim.Adam, th.optim.AdamW):
-            # One kernel for all parameters: the update is memory-bound otherwise.
-            optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         if "features_extractor_class" in kwargs:
             raise ValueError(
                 "HerPolicy brings its own features extractor; leave features_extractor_class out"
@@ -106,8 +112,7 @@ class HerPolicy(WholeModule, TD3Policy):
                 net_arch=[256, 256, 256] if net_arch is None else net_arch,
                 features_extractor_class=NormalizedGoalExtractor,
                 features_extractor_kwargs={"clip": features_clip},
-                optimizer_kwargs=optimizer_kwargs,
-                **kwargs,
+                **with_fused_adam(kwargs),
             )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
