@@ -133,7 +133,7 @@ class ProcessVecEnv(VecEnv):
     def step_async(self, actions: np.ndarray) -> None:
         """Send the actions (n_envs, ...) to the processes."""
         for worker, rows in zip(self._workers, self._rows, strict=True):
-            worker.ask("step", np.asarray(actions)[rows])
+            worker.ask_step(np.asarray(actions)[rows])
 
     def step_wait(
         self,
@@ -232,6 +232,10 @@ class _Worker:
 
     def ask(self, name: str, *arguments: Any) -> None:
         self._pipe.send_bytes(cloudpickle.dumps((name, arguments)))
+
+    def ask_step(self, actions: np.ndarray) -> None:
+        """Ask for a step; numbers need no cloudpickle, which takes three times as long."""
+        self._pipe.send(("step", (actions,)))
 
     def answer(self) -> Any:
         """Wait for what was asked; raise what went wrong there."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..any_task.tasks import check_followable, success_distance_of, surface_choices
+from ..any_task.tasks import check_followable, horizon_of, success_distance_of, surface_choices
 from ..common.plain_yaml import load_yaml
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, object_id
@@ -32,6 +32,7 @@ _TOLERANCES = (
     ("replay_buffer_kwargs", "moved_distance"),
     ("replay_buffer_kwargs", "min_goal_distance"),
 )
+_HORIZON = 50  # steps of the episodes that presets give updates and tests for
 # The package's task that one of one's own is set up as, by whether its object is pushed.
 SIMILAR = {True: "FollowObject/PushSideGap-v0", False: "FollowObject/PnPSimpleV2-v0"}
 
@@ -113,6 +114,8 @@ def run_config(
             if surface_choices(env_id)[0]:
                 settings = of_runs | _flattened(_entry(entries, SIMILAR[True], path), path)
             _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
+    if env_id not in IDS and env_id not in entries:
+        _fit_to_horizon(settings, horizon_of(env_id) or _HORIZON)
     of_object = object_id(env_id if env_id in IDS else SIMILAR[False])
     if has_object_stage and _find(entries, of_object) is not None:
         settings |= _object_stage(_entry(entries, of_object, path), path)
@@ -336,6 +339,15 @@ def _scale_distances(settings: dict[str, Any], factor: float) -> None:
         group = settings.get(outer)
         if isinstance(group, dict) and name in group:
             settings[outer] = {**group, name: round(group[name] * factor, 6)}
+
+
+def _fit_to_horizon(settings: dict[str, Any], horizon: int) -> None:
+    """Keep updates and tests per env step what they are in the presets' episodes."""
+    updates = settings.get("gradient_steps", -1)
+    if updates > 0:
+        settings["gradient_steps"] = max(1, round(updates * horizon / _HORIZON))
+    if "test_every" in settings:
+        settings["test_every"] = max(1, round(settings["test_every"] * _HORIZON / horizon))
 
 
 def _override(settings: dict[str, Any], name: str, value: Any) -> None:

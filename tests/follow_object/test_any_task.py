@@ -194,3 +194,17 @@ def test_presets_set_a_task_up_as_the_packages_most_similar_one() -> None:
     assert (replay["moved_distance"], replay["min_goal_distance"]) == (0.02, 0.02)
     given = run_config("Near-v0", overrides={"curriculum.min_distance": 0.5}).settings
     assert given["curriculum"]["min_distance"] == 0.5
+
+
+gym.register("Longer-v0", arm_and_wall.ArmAndWall, max_episode_steps=150)
+
+
+@pytest.mark.parametrize("method", ["fo", "her"])
+def test_longer_episodes_have_as_many_updates_and_tests_an_env_step(method: str) -> None:
+    usual, longer = (run_config(task, method=method).settings for task in (ARM, "Longer-v0"))
+    updates = [each["algorithm"]["gradient_steps"] for each in (usual, longer)]
+    assert updates[1] == 3 * updates[0]
+    if method == "fo":
+        assert (usual["test_every"], longer["test_every"]) == (4, 1)
+    given = run_config("Longer-v0", method=method, overrides={"gradient_steps": 7})
+    assert given.settings["algorithm"]["gradient_steps"] == 7
