@@ -9,6 +9,7 @@ from stable_baselines3.common.noise import ActionNoise
 
 from ..common.answers import check_shape
 
+
 _SMOOTHING = 0.02  # weight of an episode in the running success rate
 
 

@@ -360,7 +360,6 @@ class HerDDPG(KeptDDPG):
             self.logger.record(name, mean)
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
             self.logger.record("train/moved_share", self.replay_buffer.moved_share())
-            self.logger.record("train/success", self.success)
             for name, value in self.replay_buffer.selection_log().items():
                 self.logger.record(name, value)
 

@@ -14,7 +14,6 @@ from toy import HORIZON, PointEnv
 
 from sb3_follow_object.callbacks.rollout import run_episodes
 from sb3_follow_object.ddpg.actor_files import load_actor, save_actor
-from sb3_follow_object.ddpg.exploration import running_success
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import make_vec
 
@@ -119,37 +118,6 @@ def test_average_of_the_actor_is_a_plain_mean_at_first() -> None:
     model.policy.update_average = spy  # type: ignore[method-assign]
     model.learn(4 * 3 * HORIZON, log_interval=None)  # type: ignore[arg-type]
     assert seen[:3] == pytest.approx([0.0, 1 / 2, 2 / 3])
-
-
-@pytest.mark.parametrize(("success", "left"), [(0.0, 1.0), (0.75, 0.25), (1.0, 0.0)])
-def test_noise_that_fades_is_as_loud_as_the_robot_fails(success: float, left: float) -> None:
-    same = {"random_action_prob": 0.4, "noise_std": 0.1}
-    loud, fading = (make_model(n_envs=100, noise_fades=fades, **same) for fades in (False, True))
-    for model in (loud, fading):
-        model._setup_learn(1000)
-        model.success = success
-        wanted = model.actor.predict(model._last_obs, deterministic=True)[0]  # type: ignore[arg-type]
-        taken = np.stack([model._sample_action(0, None, 100)[1] for _ in range(50)])
-        moved = np.abs(taken - wanted).max(axis=2)
-        share = left if model is fading else 1.0
-        # Of what is drawn uniformly, nine in ten lie so far away.
-        assert np.mean(moved > 0.5) == pytest.approx(0.4 * share * 0.8, abs=0.12 * share + 1e-9)
-        assert np.median(moved) <= 0.25 * share + 1e-6
-
-
-def test_success_is_that_of_episodes_with_original_goals() -> None:
-    ended = np.array([True, True, True, False])
-    original, failed = {"is_success": True}, {"is_success": False, "imagined_level": 0}
-    imagined = {"is_success": True, "imagined_level": 3}
-    assert running_success(0.5, ended, [original, imagined, {}, original]) == 0.5 + 0.02 * 0.5
-    assert running_success(0.5, ended, [failed, imagined, {}, original]) == 0.5 - 0.02 * 0.5
-    model = make_model(n_envs=4, noise_fades=True)
-    model.learn(2400, log_interval=None)  # type: ignore[arg-type]
-    rate = model.success
-    assert 0.0 < rate < 1.0
-    copied = make_model(n_envs=4, noise_fades=True)
-    copied.load_training_state(model.training_state())
-    assert copied.success == rate
 
 
 def test_action_l2_keeps_actions_small() -> None:
