@@ -27,7 +27,7 @@ from ..replay.her_replay_buffer import FollowObjectReplayBuffer
 from ..settings.learning import AlgorithmSettings
 from .auxiliary import Transitions, make_auxiliary, resolve_auxiliary
 from .env_checks import check_goals, check_rewards, check_wrappers, horizon_of
-from .exploration import explored, running_success
+from .exploration import explored
 from .input_moments import InputMoments
 from .kept_state import KeptDDPG
 from .policies import HerPolicy
@@ -50,8 +50,7 @@ class HerDDPG(KeptDDPG):
     - the critic's targets are clipped to [-1/(1 - gamma), 0], where returns of a -1/0 reward lie;
     - with `hindsight_bound` a target is at least what the stored episode proves to be possible;
     - the actor's loss has `action_l2` times the mean squared action added;
-    - with probability `random_action_prob` an action is uniform, else Gaussian noise is added,
-      and with `noise_fades` the less of both the more the robot succeeds;
+    - with probability `random_action_prob` an action is uniform, else Gaussian noise is added;
     - episodes may be collected from several environments at once: `train_freq=(n, "episode")`;
     - `predict` may use an average of the actor's weights over the last updates: `average_decay`;
     - target networks may be moved once every `target_update_interval` updates;
@@ -64,9 +63,6 @@ class HerDDPG(KeptDDPG):
         train_freq: in episodes of every environment, or in steps of every environment.
         noise_std: of the Gaussian noise on each action in [-1, 1]; `action_noise` replaces it.
         random_action_prob: in [0, 1].
-        noise_fades: multiply both by 1 - `success`, the running success rate of the training's
-            episodes with original goals. Beyond the paper: late in training it is noise that spoils
-            what the actor would do.
         action_l2: weight, >= 0.
         target_clip: (low, high) bounds of the targets; "auto" is [-1/(1 - gamma), 0]; None, none.
         hindsight_bound: raise the target of a transition, whose episode was on the hindsight goal j
@@ -123,7 +119,6 @@ class HerDDPG(KeptDDPG):
         optimize_memory_usage: bool = AlgorithmSettings.optimize_memory_usage,
         noise_std: float = AlgorithmSettings.noise_std,
         random_action_prob: float = AlgorithmSettings.random_action_prob,
-        noise_fades: bool = AlgorithmSettings.noise_fades,
         action_l2: float = AlgorithmSettings.action_l2,
         target_clip: tuple[float, float] | str | None = AlgorithmSettings.target_clip,
         hindsight_bound: bool = AlgorithmSettings.hindsight_bound,
@@ -156,7 +151,6 @@ class HerDDPG(KeptDDPG):
             optimize_memory_usage=optimize_memory_usage,
             noise_std=noise_std,
             random_action_prob=random_action_prob,
-            noise_fades=noise_fades,
             action_l2=action_l2,
             target_clip=target_clip,
             hindsight_bound=hindsight_bound,
@@ -200,8 +194,6 @@ class HerDDPG(KeptDDPG):
         )
         self.noise_std = settings.noise_std
         self.random_action_prob = settings.random_action_prob
-        self.noise_fades = settings.noise_fades
-        self.success = 0.0
         self.action_l2 = settings.action_l2
         self.target_clip = settings.target_clip
         self.hindsight_bound = settings.hindsight_bound
@@ -282,16 +274,10 @@ class HerDDPG(KeptDDPG):
             action, _ = self.actor.predict(self._last_obs, deterministic=True)
             scaled = self.policy.scale_action(action)
             noise = self.noise_std if action_noise is None else action_noise
-            left = 1.0 - self.success if self.noise_fades else 1.0
-            scaled = explored(scaled, noise, self.random_action_prob, self.rng, left)
+            scaled = explored(scaled, noise, self.random_action_prob, self.rng)
         with np.errstate(under="ignore"):
             scaled = scaled.astype(np.float32)
         return self.policy.unscale_action(scaled), scaled
-
-    def _store_transition(self, *args: Any) -> None:
-        super()._store_transition(*args)
-        dones, infos = args[-2:]
-        self.success = running_success(self.success, dones, infos)
 
     def _update_moments(self) -> None:
         """Standardise inputs from now on by all that has been stored."""

@@ -28,7 +28,6 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
     rng: np.random.Generator
     moments: InputMoments
     auxiliary_critic: AuxiliaryCritic | None
-    success: float
     _device_replay: DeviceReplay | None
 
     def _buffer_was_replaced(self, buffer: ReplayBuffer) -> None:
@@ -75,7 +74,6 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
             if self._device_replay is None
             else self._device_replay.generator.get_state(),
             "last_obs": None if self._step_is_open else self._last_obs,
-            "success": self.success,
             "counters": {name: getattr(self, name) for name in self._COUNTERS},
         }
 
@@ -93,7 +91,6 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
             self._device_replay.generator.set_state(state["device_rng"])
         self._last_obs = state["last_obs"]
         self._last_episode_starts = np.ones(self.n_envs, dtype=bool)
-        self.success = float(state.get("success", 0.0))
         for name in self._COUNTERS:
             setattr(self, name, state["counters"][name])
 

@@ -190,9 +190,6 @@ class GoalPolicySettings(Group):
     """The networks of stock DDPG and TD3."""
 
     title = "`policy_kwargs`, of `GoalPolicy`"
-    noise_fades: Annotated[
-        Flag, setting("whether both fall as episodes with original goals succeed")
-    ] = False
     action_l2: Annotated[
         Number, setting("weight of the mean squared action in the actor's loss", ge=0)
     ] = 1.0
