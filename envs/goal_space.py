@@ -39,6 +39,10 @@ class GoalSpace:
         way: np.ndarray = (1.0 - share) * first + share * second
         return way
 
+    def farther(self, goals: Any, origin: Any, factor: float) -> Any:
+        """Goals (..., size) as many times as far from their origins; of arrays or of tensors."""
+        return origin + factor * (goals - origin)
+
     def point(self, goals: np.ndarray) -> np.ndarray:
         """Where goals (..., size) are in space, (..., 3) metres; at least 3 numbers each."""
         return goals[..., :3]

@@ -240,7 +240,11 @@ class DeviceReplay(WholeCopies):
 
         desired = th.where(virtual[:, None], goal, fields[DESIRED])
         fields |= {DESIRED: desired, NEXT_DESIRED: desired, ACHIEVED: achieved}
-        rewards = th.where(virtual, self.reward(achieved, desired), fields["rewards"])
+        if buffer.goal_margin > 0.0:
+            factor = 1.0 / (1.0 - buffer.goal_margin)
+            rewards = self.reward(buffer.goal_space.farther(achieved, desired, factor), desired)
+        else:
+            rewards = th.where(virtual, self.reward(achieved, desired), fields["rewards"])
         later = (chosen - step).float()
         steps = th.where(virtual & (later >= 0.0), later, th.inf)
         obs, next_obs = (

@@ -52,6 +52,10 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         min_goal_distance: metres; a hindsight goal nearer than this to where the episode's achieved
             goal began was reached before anything was done. Such a transition keeps the goal that
             was shown, so that episodes that moved nothing do not teach to stay. 0 is the paper's.
+        goal_margin: share in [0, 1) of the tolerance at whose outer edge a goal does not count as
+            reached in what is learned from: a policy that is paid for as little movement as will do
+            stops at the edge, and half of the times beyond it. For environments that pay by whether
+            a goal is near enough. 0 is the paper's.
         cher: keyword arguments of `GoalSelection`, which then chooses each batch from more
             candidates; None chooses nothing.
         reward_function: called as f(achieved (n, d), desired (n, d), infos) -> (n,); by default the
@@ -86,6 +90,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         moved_priority: str = ReplaySettings.moved_priority,
         step_seconds: float = ReplaySettings.step_seconds,
         min_goal_distance: float = ReplaySettings.min_goal_distance,
+        goal_margin: float = ReplaySettings.goal_margin,
         cher: dict[str, Any] | None = None,
         reward_function: RewardFunction | None = None,
         seed: int | None = None,
@@ -101,6 +106,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             moved_priority=moved_priority,  # type: ignore[arg-type]  # a word is checked there
             step_seconds=step_seconds,
             min_goal_distance=min_goal_distance,
+            goal_margin=goal_margin,
             cher=cher,
             seed=seed,
         )
@@ -125,6 +131,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         self.moved_priority = settings.moved_priority
         self.step_seconds = settings.step_seconds
         self.min_goal_distance = settings.min_goal_distance
+        self.goal_margin = settings.goal_margin
         self.selection = None if settings.cher is None else GoalSelection(**settings.cher)
         self.reward_function = reward_function
         goal_shape = self.observations["desired_goal"].shape
@@ -313,6 +320,11 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         # Last, as it drives all else out of the cache.
         batch = self._gather(flat, achieved)
         batch.rewards[virtual] = rewards
+        if self.goal_margin > 0.0:
+            kept = np.delete(np.arange(batch_size), virtual)
+            shown = batch.observations["desired_goal"][kept]
+            reached = self._goals_in(achieved.take(kept, axis=0))
+            batch.rewards[kept] = self._reward(reached, shown, flat.take(kept))
         for desired in batch.desired_goals():
             for i in range(goals.shape[1]):  # half the time of all at once, for a few coordinates
                 desired[virtual, i] = goals[:, i]
@@ -380,6 +392,8 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         """Rewards (n,) of goals achieved for goals desired (n, d) in the transitions `flat`."""
         if not len(flat):
             return np.zeros(0, dtype=np.float32)
+        if self.goal_margin > 0.0:
+            achieved = self.goal_space.farther(achieved, desired, 1.0 / (1.0 - self.goal_margin))
         # Where no infos are kept, one empty dict does for all.
         infos = list(self._take(self.infos, flat)) if self.copy_info_dict else [{}] * len(flat)
         if self.reward_function is not None:

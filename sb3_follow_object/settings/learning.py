@@ -79,6 +79,9 @@ class ReplaySettings(Group):
         Number,
         setting("a hindsight goal nearer to the start than this is not used", unit="metres", ge=0),
     ] = 0.0
+    goal_margin: Annotated[
+        Number, setting("share of the tolerance that is not good enough in replay", ge=0, lt=1)
+    ] = 0.0
     cher: Annotated[
         dict[str, Any] | None,
         setting("chooses each batch from more candidates", none="none", group=CherSettings),

@@ -11,7 +11,7 @@ import torch as th
 from small_buffers import LazyPointEnv, as_arrays, fill, make_buffer, make_env
 from small_models import TINY, assert_resumes_exactly, make_model, success_rate, weights
 from stable_baselines3.common.vec_env import DummyVecEnv
-from toy import HORIZON, PointEnv, StraightPredictor
+from toy import HORIZON, THRESHOLD, PointEnv, StraightPredictor
 
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import make_vec
@@ -52,6 +52,29 @@ def test_relabelled_rewards_are_the_environments(env_class: type[PointEnv]) -> N
     assert not got["done"].any()  # a truncation is not a termination
 
 
+class NearPointEnv(PointEnv):
+    def reset(self, **kwargs: Any) -> Any:
+        super().reset(**kwargs)
+        self.goal = self.position + 0.06
+        return self._observe(), {}
+
+
+@pytest.mark.parametrize("where", ["host", "device"])
+@pytest.mark.parametrize("n_sampled_goal", [0, 4])
+def test_a_margin_asks_goals_to_be_reached_more_closely(where: str, n_sampled_goal: int) -> None:
+    env = make_env(env_class=NearPointEnv)
+    buffer = make_buffer(env, goal_margin=0.25, n_sampled_goal=n_sampled_goal)
+    fill([buffer], env, 400)
+    judge = buffer if where == "host" else mirror(buffer)
+    got = as_arrays(judge.sample_with_steps(8000)[0])
+    distance = np.linalg.norm(got["next_achieved"] - got["goal"], axis=1)
+    clear = np.abs(distance - 0.75 * THRESHOLD) > 1e-5
+    np.testing.assert_array_equal(got["reward"][clear], -1.0 * (distance > 0.75 * THRESHOLD)[clear])
+    edge = (distance > 0.8 * THRESHOLD) & (distance < THRESHOLD)
+    assert edge.sum() > 20, "without the margin these would count as reached"
+    assert buffer.rewards.max() == 0.0, "what is stored is what was paid"
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -59,8 +82,9 @@ def test_relabelled_rewards_are_the_environments(env_class: type[PointEnv]) -> N
         {"goal_selection_strategy": "final"},
         {"goal_selection_strategy": "episode"},
         {"moved_ratio": 0.5, "moved_priority": "energy", "min_goal_distance": 0.05},
+        {"goal_margin": 0.2},
     ],
-    ids=["future", "final", "episode", "moved"],
+    ids=["future", "final", "episode", "moved", "margin"],
 )
 def test_distribution_is_that_of_the_host(options: dict[str, Any]) -> None:
     """Means of all that is drawn, and of its products, agree within their standard errors."""
