@@ -101,7 +101,7 @@ OBJECT_STAGE = (
 )
 # What each method's file says besides her.yml's settings (fo.yml's, where goals are imagined).
 OWN = {
-    "shaped": {"hindsight_bound", "target_clip", "reward_type"},
+    "shaped": {"hindsight_bound", "target_clip", "reward_type", "replay_buffer_kwargs.goal_margin"},
     "rnd": {"auxiliary"},
     "sldr": {"auxiliary", *OBJECT_STAGE},
     "fo-sldr": {"auxiliary"},
