@@ -2,9 +2,9 @@
 
     python benchmarks/recipe.py runs/*
 
-A run takes the place of one of the same task, method and seed in benchmarks/recipe. The table of
-README and that of docs/reaching.md are made of all that are there, beside FO and HER as they were
-before 0.2.0 (benchmarks/results).
+A run takes the place of one of the same task, method and seed in benchmarks/recipe. The tables of
+README and of docs/reaching.md are made of all that are there, beside FO and HER as they were before
+0.2.0 (benchmarks/results), and that of docs/robots.md of those on environments of others.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from sb3_follow_object.envs import TASKS
 
 HERE = Path(__file__).parent
 KEPT, BEFORE = HERE / "recipe", HERE / "results"
-README, PAGE = HERE.parent / "README.md", HERE.parent / "docs" / "reaching.md"
+README, DOCS = HERE.parent / "README.md", HERE.parent / "docs"
+PAGE, ROBOTS = DOCS / "reaching.md", DOCS / "robots.md"
 BEGIN, END = "<!-- recipe: python benchmarks/recipe.py -->\n", "<!-- end of recipe -->"
 ENOUGH = 0.9
 STOPPED = "stopped before its end; no final test"
@@ -29,7 +30,7 @@ STOPPED = "stopped before its end; no final test"
 
 def name_of(row: dict[str, Any]) -> str:
     """Return the name of a run's curve."""
-    return f"{row['task']}-{row['method']}-{row['seed']}"
+    return f"{row['task'].replace('/', '-')}-{row['method']}-{row['seed']}"
 
 
 def validations(file: Path) -> list[dict[str, str]]:
@@ -109,8 +110,8 @@ def her(task: str) -> str:
 
 def small_table(rows: list[dict[str, Any]]) -> str:
     """Return README's table, a line a task: seed 0 of FO."""
-    head = "| task | 0.9 after env steps | minutes | FO in the end | FO before 0.2.0 | HER |\n"
-    lines = [head + "|---|---|---|---|---|---|"]
+    head = ("task", "0.9 after env steps", "minutes", "FO in the end", "FO before 0.2.0", "HER")
+    lines = []
     for task in TASKS:
         found = [r for r in rows if (r["task"], r["method"], r["seed"]) == (task, "fo", 0)]
         steps, minutes, end = "not run", "", ""
@@ -118,31 +119,48 @@ def small_table(rows: list[dict[str, Any]]) -> str:
             steps, minutes = there(first_good(KEPT / f"{name_of(found[0])}.csv"))
             rate = found[0].get("success_rate")
             end = "stopped" if rate is None else f"{rate:.2f}"
-        cells = (task, steps, minutes, end, earlier(task), her(task))
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        lines.append((task, steps, minutes, end, earlier(task), her(task)))
+    return table(head, lines)
+
+
+def run_cells(row: dict[str, Any]) -> tuple[str, ...]:
+    """Return what a table says of a run."""
+    steps, minutes = there(first_good(KEPT / f"{name_of(row)}.csv"))
+    commit = str(row["versions"]["commit"])[:7]
+    who = (row["task"], row["method"].upper(), str(row["seed"]))
+    return (*who, steps, minutes, in_the_end(row), commit)
+
+
+def table(head: tuple[str, ...], lines: list[tuple[str, ...]]) -> str:
+    """Return a table in Markdown."""
+    rows = (head, ("---",) * len(head), *lines)
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in rows)
+
+
+HEAD = ("task", "method", "seed", "0.9 after env steps", "minutes", "in the end", "commit")
 
 
 def full_table(rows: list[dict[str, Any]]) -> str:
-    """Return the table of docs/reaching.md, a line a run."""
-    head = (
-        "| task | method | seed | 0.9 after env steps | minutes | in the end "
-        "| 0.9 before 0.2.0 | commit |\n"
-    )
-    lines = [head + "|---" * 8 + "|"]
-    for row in rows:
-        steps, minutes = there(first_good(KEPT / f"{name_of(row)}.csv"))
-        commit = str(row["versions"]["commit"])[:7]
-        cells = (row["task"], row["method"].upper(), str(row["seed"]), steps, minutes)
-        ends = (in_the_end(row), earlier(row["task"]), commit)
-        lines.append(f"| {' | '.join((*cells, *ends))} |")
-    return "\n".join(lines) + "\n"
+    """Return the table of docs/reaching.md, a line a run of the package's own tasks."""
+    own = [row for row in rows if row["task"] in TASKS]
+    lines = [(*run_cells(row), earlier(row["task"])) for row in own]
+    return table((*HEAD, "0.9 before 0.2.0"), lines)
 
 
-def with_table(text: str, table: str) -> str:
+def robots_table(rows: list[dict[str, Any]]) -> str:
+    """Return the table of docs/robots.md, a line a run of an environment of others."""
+    return table(HEAD, [run_cells(row) for row in rows if row["task"] not in TASKS])
+
+
+def tables(rows: list[dict[str, Any]]) -> dict[Path, str]:
+    """Return the table of each page."""
+    return {README: small_table(rows), PAGE: full_table(rows), ROBOTS: robots_table(rows)}
+
+
+def with_table(text: str, written: str) -> str:
     """Return a page with the table between its marks written anew."""
     head, rest = text.split(BEGIN)
-    return head + BEGIN + table + END + rest.split(END)[1]
+    return head + BEGIN + written + END + rest.split(END)[1]
 
 
 def main() -> None:
@@ -150,8 +168,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("runs", nargs="*", type=Path, help="run folders")
     rows = keep(parser.parse_args().runs)
-    for page, table in ((README, small_table(rows)), (PAGE, full_table(rows))):
-        page.write_text(with_table(page.read_text(), table))
+    for page, text in tables(rows).items():
+        page.write_text(with_table(page.read_text(), text))
     print(f"{len(rows)} runs in {KEPT}")
 
 
