@@ -114,7 +114,8 @@ def run_config(
             if surface_choices(env_id)[0]:
                 settings = of_runs | _flattened(_entry(entries, SIMILAR[True], path), path)
             _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
-    if env_id not in IDS and env_id not in entries:
+    ours = file is None and preset == "default"  # the paper's cycles are the paper's
+    if ours and env_id not in IDS and env_id not in entries:
         _fit_to_horizon(settings, horizon_of(env_id) or _HORIZON)
     of_object = object_id(env_id if env_id in IDS else SIMILAR[False])
     if has_object_stage and _find(entries, of_object) is not None:

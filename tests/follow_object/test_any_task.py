@@ -206,5 +206,7 @@ def test_longer_episodes_have_as_many_updates_and_tests_an_env_step(method: str)
     assert updates[1] == 3 * updates[0]
     if method == "fo":
         assert (usual["test_every"], longer["test_every"]) == (4, 1)
+    paper = [run_config(task, method=method, preset="paper") for task in (ARM, "Longer-v0")]
+    assert paper[0].settings["algorithm"] == paper[1].settings["algorithm"]
     given = run_config("Longer-v0", method=method, overrides={"gradient_steps": 7})
     assert given.settings["algorithm"]["gradient_steps"] == 7
