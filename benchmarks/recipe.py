@@ -47,7 +47,7 @@ def first_good(file: Path) -> dict[str, str] | None:
 def read_row(run: Path) -> dict[str, Any]:
     """Return what is kept of a run besides its curve."""
     config = json.loads((run / "config.json").read_text())
-    task = config["env_id"].removeprefix("FollowObject/").removesuffix("-v0")
+    task = config["env_id"].rpartition(":")[2].removeprefix("FollowObject/").removesuffix("-v0")
     row = {"task": task, "method": config["method"], "seed": config["seed"]}
     if (run / "result.json").exists():
         row |= json.loads((run / "result.json").read_text())
@@ -55,7 +55,7 @@ def read_row(run: Path) -> dict[str, Any]:
         last = validations(run / "evaluations.csv")[-1]
         row |= {"env_steps": int(last["env_steps"]), "stopped": STOPPED}
         row |= {"command": (run / "command.txt").read_text().strip()}
-    return {**row, "versions": json.loads((run / "versions.json").read_text())}
+    return {**row, "task": task, "versions": json.loads((run / "versions.json").read_text())}
 
 
 def keep(runs: list[Path]) -> list[dict[str, Any]]:
