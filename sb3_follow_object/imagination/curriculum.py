@@ -16,7 +16,7 @@ class Curriculum:
 
     Each episode shows its original goal with probability ``p`` and otherwise the imagined goal of
     a level k drawn from U{1..k_max}. A test at level k_max that reaches ``threshold`` raises k_max
-    by one. Once the last level is reached (and passed, with ``finish_threshold``) the curriculum is
+    by one, or by up to ``stride``. Once the last level is reached (and passed, with ``finish_threshold``) the curriculum is
     finished and shows original goals only.
 
     Args:
@@ -25,6 +25,8 @@ class Curriculum:
         threshold: success rate at k_max that raises k_max, in [0, 1].
         sequential: whether the tests of a level add up until they decide (`SequentialTest`), so
             that chance cannot pass it; otherwise each stands alone (paper).
+        stride: most levels that a test raises k_max by, >= 1: as many as its success rate holds the
+            threshold, so that what is learned at once need not wait for a test of every level.
         finish_threshold: success rate at the last level that ends the curriculum, in [0, 1]; until
             then imagined goals of all levels go on. 0 is the paper's: reaching that level ends it.
         k_max: first value of k_max, in 1..n_levels.
@@ -45,6 +47,7 @@ class Curriculum:
         p: float = CurriculumSettings.p,
         threshold: float = CurriculumSettings.threshold,
         sequential: bool = CurriculumSettings.sequential,
+        stride: int = CurriculumSettings.stride,
         finish_threshold: float = CurriculumSettings.finish_threshold,
         k_max: int = CurriculumSettings.k_max,
         levels: str = CurriculumSettings.levels,
@@ -56,6 +59,7 @@ class Curriculum:
             p=p,
             threshold=threshold,
             sequential=sequential,
+            stride=stride,
             finish_threshold=finish_threshold,
             k_max=k_max,
             levels=levels,  # type: ignore[arg-type]  # a word is checked there
@@ -68,6 +72,7 @@ class Curriculum:
         self.n_levels = self.horizon if settings.levels == "time" else settings.n_levels
         self.p = settings.p
         self.threshold = settings.threshold
+        self.stride = settings.stride
         self.finish_threshold = settings.finish_threshold
         self.sampling = settings.sampling
         self.min_distance = settings.min_distance
@@ -129,7 +134,8 @@ class Curriculum:
         if at_last:
             self._passed_last = True
         else:
-            self.k_max += 1
+            held = int(success_rate / threshold + 1e-9) if threshold > 0.0 else 1
+            self.k_max = min(self.n_levels, self.k_max + min(max(1, held), self.stride))
         return True
 
     def state_dict(self) -> dict[str, Any]:

@@ -25,6 +25,10 @@ class CurriculumSettings(Group):
     sequential: Annotated[
         Flag, setting("whether tests of a level add up until they decide, or each stands alone")
     ] = False
+    stride: Annotated[
+        Whole,
+        setting("most levels that a passed test raises k_max by, one for each threshold", ge=1),
+    ] = 1
     finish_threshold: Annotated[
         Number,
         setting("success rate at the last level that ends the curriculum; 0, none", ge=0, le=1),

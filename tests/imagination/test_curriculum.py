@@ -52,6 +52,27 @@ def test_k_max_grows_by_one_when_the_threshold_is_reached_and_stops_at_the_last_
     assert curriculum.k_max == 4
 
 
+@pytest.mark.parametrize(
+    ("stride", "success_rate", "k_max"),
+    [(1, 1.0, 3), (4, 0.14, 2), (4, 0.15, 3), (4, 0.29, 3), (4, 0.3, 4), (4, 0.45, 5), (4, 1.0, 6)],
+)
+def test_a_test_raises_k_max_by_a_level_for_each_threshold_that_it_holds(
+    stride: int, success_rate: float, k_max: int
+) -> None:
+    curriculum = Curriculum(50, levels="path", threshold=0.15, stride=stride)
+    assert curriculum.report(success_rate) == (k_max > 2)
+    assert curriculum.k_max == k_max
+
+
+def test_a_stride_ends_at_the_last_level() -> None:
+    curriculum = Curriculum(50, levels="path", n_levels=4, threshold=0.0, stride=3)
+    curriculum.report(0.0)
+    assert curriculum.k_max == 3, "a threshold of 0 is held once"
+    curriculum = Curriculum(50, levels="path", n_levels=4, threshold=0.1, stride=3)
+    curriculum.report(1.0)
+    assert (curriculum.k_max, curriculum.finished) == (4, True)
+
+
 def test_a_finished_curriculum_draws_original_goals_only() -> None:
     original, _ = Curriculum(10, k_max=10, p=0.0).draw(1000, RNG(0))
     assert original.all()
