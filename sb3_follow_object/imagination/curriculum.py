@@ -16,8 +16,8 @@ class Curriculum:
 
     Each episode shows its original goal with probability ``p`` and otherwise the imagined goal of
     a level k drawn from U{1..k_max}. A test at level k_max that reaches ``threshold`` raises k_max
-    by one, or by up to ``stride``. Once the last level is reached (and passed, with ``finish_threshold``) the curriculum is
-    finished and shows original goals only.
+    by one, or by up to ``stride``. Once the last level is reached (and passed, with
+    ``finish_threshold``) the curriculum is finished and shows original goals only.
 
     Args:
         horizon: T, steps of an episode, >= 1.
