@@ -40,6 +40,8 @@ class Curriculum:
         ValueError: an argument is outside its range.
     """
 
+    stride = 1  # of those pickled before there was one
+
     def __init__(
         self,
         horizon: int,

@@ -71,6 +71,8 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             wrapper that imagines them, or, at the first step, an episode does not fit.
     """
 
+    goal_margin = 0.0  # of buffers pickled before there was one
+
     def __init__(
         self,
         buffer_size: int,
