@@ -157,7 +157,7 @@ def effector_seen_in(env_id: str) -> tuple[int, int, int] | None:
     return None if found is None else found.entries
 
 
-def horizon_of(env_id: str) -> int | None:
+def registered_horizon(env_id: str) -> int | None:
     """T of a registered task's episodes; None, it has no limit."""
     spec = gym.registry.get(import_task(env_id))
     return None if spec is None else spec.max_episode_steps
@@ -168,4 +168,4 @@ def steps_to_reach(env_id: str) -> int:
 
     The package's own have 25 of some 50: robots that need longer episodes are slower.
     """
-    return max(_LEAST_TO_REACH, (horizon_of(env_id) or 0) // 2)
+    return max(_LEAST_TO_REACH, (registered_horizon(env_id) or 0) // 2)

@@ -53,9 +53,9 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             goal began was reached before anything was done. Such a transition keeps the goal that
             was shown, so that episodes that moved nothing do not teach to stay. 0 is the paper's.
         goal_margin: share in [0, 1) of the tolerance at whose outer edge a goal does not count as
-            reached in what is learned from: a policy that is paid for as little movement as will do
-            stops at the edge, and half of the times beyond it. For environments that pay by whether
-            a goal is near enough. 0 is the paper's.
+            reached in what is learned from: a policy whose actions have a price moves the object as
+            little as will do, and what stops at the edge often stops beyond it. For environments
+            that pay by whether a goal is near enough. 0 is the paper's.
         cher: keyword arguments of `GoalSelection`, which then chooses each batch from more
             candidates; None chooses nothing.
         reward_function: called as f(achieved (n, d), desired (n, d), infos) -> (n,); by default the
@@ -317,19 +317,15 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             goals[chosen] = self._imagined_goals(episode[virtual[chosen]])
             steps[chosen] = np.inf
         steps_to_goal[virtual] = steps
-        reached = self._goals_in(achieved.take(virtual, axis=0))
-        rewards = self._reward(reached, goals, flat.take(virtual))
-        # Last, as it drives all else out of the cache.
         batch = self._gather(flat, achieved)
-        batch.rewards[virtual] = rewards
-        if self.goal_margin > 0.0:
-            kept = np.delete(np.arange(batch_size), virtual)
-            shown = batch.observations["desired_goal"][kept]
-            reached = self._goals_in(achieved.take(kept, axis=0))
-            batch.rewards[kept] = self._reward(reached, shown, flat.take(kept))
         for desired in batch.desired_goals():
             for i in range(goals.shape[1]):  # half the time of all at once, for a few coordinates
                 desired[virtual, i] = goals[:, i]
+        # With a margin rewards for the goals that were shown are others than those that were paid.
+        judged = np.arange(batch_size) if self.goal_margin > 0.0 else virtual
+        reached = self._goals_in(achieved.take(judged, axis=0))
+        shown = batch.observations["desired_goal"].take(judged, axis=0)
+        batch.rewards[judged] = self._reward(reached, shown, flat.take(judged))
 
         if self.selection is not None:
             chosen = self.selection.choose(

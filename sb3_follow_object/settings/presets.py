@@ -8,7 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..any_task.tasks import check_followable, horizon_of, success_distance_of, surface_choices
+from ..any_task.tasks import (
+    check_followable,
+    registered_horizon,
+    success_distance_of,
+    surface_choices,
+)
 from ..common.plain_yaml import load_yaml
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, object_id
@@ -116,7 +121,7 @@ def run_config(
             _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
     ours = file is None and preset == "default"  # the paper's cycles are the paper's
     if ours and env_id not in IDS and env_id not in entries:
-        _fit_to_horizon(settings, horizon_of(env_id) or _HORIZON)
+        _fit_to_horizon(settings, registered_horizon(env_id) or _HORIZON)
     of_object = object_id(env_id if env_id in IDS else SIMILAR[False])
     if has_object_stage and _find(entries, of_object) is not None:
         settings |= _object_stage(_entry(entries, of_object, path), path)
