@@ -39,9 +39,15 @@ class GoalSpace:
         way: np.ndarray = (1.0 - share) * first + share * second
         return way
 
-    def farther(self, goals: Any, origin: Any, factor: float) -> Any:
-        """Goals (..., size) as many times as far from their origins; of arrays or of tensors."""
-        return origin + factor * (goals - origin)
+    def as_with_margin(self, achieved: Any, desired: Any, margin: float) -> Any:
+        """Achieved goals (..., size) so far off that a tolerance judges them as with a margin.
+
+        Args:
+            achieved: of arrays or of tensors.
+            desired: the same.
+            margin: share in [0, 1) of the tolerance that is not good enough.
+        """
+        return desired + 1.0 / (1.0 - margin) * (achieved - desired)
 
     def point(self, goals: np.ndarray) -> np.ndarray:
         """Where goals (..., size) are in space, (..., 3) metres; at least 3 numbers each."""

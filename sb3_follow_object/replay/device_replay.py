@@ -241,8 +241,8 @@ class DeviceReplay(WholeCopies):
         desired = th.where(virtual[:, None], goal, fields[DESIRED])
         fields |= {DESIRED: desired, NEXT_DESIRED: desired, ACHIEVED: achieved}
         if buffer.goal_margin > 0.0:
-            factor = 1.0 / (1.0 - buffer.goal_margin)
-            rewards = self.reward(buffer.goal_space.farther(achieved, desired, factor), desired)
+            judged = buffer.goal_space.as_with_margin(achieved, desired, buffer.goal_margin)
+            rewards = self.reward(judged, desired)
         else:
             rewards = th.where(virtual, self.reward(achieved, desired), fields["rewards"])
         later = (chosen - step).float()

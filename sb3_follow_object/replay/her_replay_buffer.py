@@ -391,7 +391,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         if not len(flat):
             return np.zeros(0, dtype=np.float32)
         if self.goal_margin > 0.0:
-            achieved = self.goal_space.farther(achieved, desired, 1.0 / (1.0 - self.goal_margin))
+            achieved = self.goal_space.as_with_margin(achieved, desired, self.goal_margin)
         # Where no infos are kept, one empty dict does for all.
         infos = list(self._take(self.infos, flat)) if self.copy_info_dict else [{}] * len(flat)
         if self.reward_function is not None:
