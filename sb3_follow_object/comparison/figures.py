@@ -9,24 +9,33 @@ from typing import Any
 
 import numpy as np
 
-from ..common.extras import need
+from ..common.extras import MissingExtra, need
 from ..envs import TASKS
 from ..runs.run_folder import EVALUATIONS
 from ..settings.methods import METHODS
+from ..settings.presets import load_config
 from .cross import PAIR, read_cross_tests
 from .plots import X_AXES, Curve, read_curve, save_png, spread
 from .results import (
     FINISHED,
     UNFINISHED,
     Group,
+    Run,
+    common_runs,
     group_runs,
     ordered,
-    quartiles,
     read_results,
+    success_rates,
 )
+from .statistics import performance_profiles, quartiles, sample_efficiency
 
 PNP_SIMPLE, OTHER_TASKS = "pnp_simple.png", "other_tasks.png"
 WALL_TIME, FINAL_SUCCESS = "wall_time.png", "final_success.png"
+ACROSS_TASKS = "across_tasks.png"
+
+_SHARES = np.linspace(0.0, 1.0, 51)  # of success, and of a task's env steps
+
+_LEGEND_WIDTH = 1.4  # inches of one of its entries
 
 _HATCH = {"hatch": "///", "facecolor": "none", "edgecolor": "0.6", "linewidth": 0.0}
 _BASELINE = "her"  # the paper's HER-a and HER-b
@@ -36,7 +45,7 @@ _SHADES = {"a": "0.35", "b": "0.7"}  # no method's colour: the bars name what th
 def draw_results(
     results: str | os.PathLike[str], out: str | os.PathLike[str], methods: Sequence[str] = METHODS
 ) -> list[Path]:
-    """Draw the paper's two figures, success against wall time, and all final successes.
+    """Draw the paper's two figures, success against wall time, final successes, and profiles.
 
     Args:
         results: folder of runs, as `compare` and benchmarks/results lay it out.
@@ -61,6 +70,7 @@ def draw_results(
         OTHER_TASKS: lambda: _curves(groups, drawn, others, "env_steps"),
         WALL_TIME: lambda: _curves(groups, drawn, tasks, "wall_s"),
         FINAL_SUCCESS: lambda: _final_success(groups, drawn, tasks),
+        ACROSS_TASKS: lambda: _across_tasks(groups, drawn),
     }
     need("matplotlib", "plots")
     out = Path(out)
@@ -116,6 +126,50 @@ def _final_success(groups: Sequence[Group], methods: Sequence[str], tasks: Seque
     axis.set_yticks(range(len(tasks)), tasks)
     figure.colorbar(image, label="final success, median over seeds")
     return figure
+
+
+def _across_tasks(groups: Sequence[Group], methods: Sequence[str]) -> Any:
+    """Return performance profiles and sample efficiency over the tasks that all methods ran."""
+    figure, axes = _figure(1, 2)
+    tasks, runs = common_runs(groups)
+    title = f"{', '.join(tasks)}\nseeds: {', '.join(f'{m} {len(s)}' for m, s in runs.items())}"
+    try:
+        profiles = performance_profiles({m: success_rates(s) for m, s in runs.items()}, _SHARES)
+        means = sample_efficiency({m: _success_over_time(s) for m, s in runs.items()})
+    except MissingExtra as error:
+        title, profiles, means = str(error), {}, {}
+    for axis, bands in zip(axes, (profiles, means), strict=True):
+        for method, (middle, low, high) in bands.items():
+            color = _color(methods, method)
+            axis.plot(_SHARES, middle, color=color)
+            if len(runs[method]) > 1:
+                axis.fill_between(_SHARES, low, high, alpha=0.2, color=color)
+        axis.set(xlim=(0, 1), ylim=(-0.02, 1.02))
+        axis.grid(alpha=0.3)
+    axes[0].set(xlabel="success", ylabel="share of runs above it")
+    axes[1].set(xlabel="share of a task's env steps", ylabel="interquartile mean of success")
+    figure.suptitle(title if tasks else "no task that two methods finished", fontsize=7)
+    _legend(figure, methods)
+    return figure
+
+
+def _success_over_time(runs: Sequence[Sequence[Run]]) -> np.ndarray:
+    """Return success at shares of the runs' env steps, (seeds, tasks, n).
+
+    A run that ended before its steps, because it was solved, keeps its last.
+    """
+    return np.array([[_success_of_budget(run) for run in seed] for seed in runs])
+
+
+def _success_of_budget(run: Run) -> np.ndarray:
+    assert run.env_steps is not None and run.success_rate is not None  # it has finished
+    steps, success = np.array([]), np.array([])
+    if _was_validated(run):
+        columns = read_curve(run.folder).columns
+        steps, success = columns["env_steps"], columns["success_rate"]
+    steps, success = np.append(steps, run.env_steps), np.append(success, run.success_rate)
+    budget = load_config(run.folder).total_timesteps
+    return np.interp(_SHARES * budget, steps, success, left=0.0)
 
 
 def _cross_panel(axis: Any, groups: Sequence[Group]) -> None:
@@ -187,12 +241,12 @@ def _curve_panel(
 
 def _read_curves(group: Group, status: str) -> list[Curve]:
     """Return the curves of a group's runs of one status that were validated at least once."""
-    curves = []
-    for run in group.of(status):
-        path = run.folder / EVALUATIONS
-        if path.exists() and len(path.read_text().splitlines()) > 1:
-            curves.append(read_curve(run.folder))
-    return curves
+    return [read_curve(run.folder) for run in group.of(status) if _was_validated(run)]
+
+
+def _was_validated(run: Run) -> bool:
+    path = run.folder / EVALUATIONS
+    return path.exists() and len(path.read_text().splitlines()) > 1
 
 
 def _figure(rows: int, columns: int) -> tuple[Any, list[Any]]:
@@ -206,7 +260,8 @@ def _legend(figure: Any, methods: Sequence[str]) -> None:
     lines = need("matplotlib.lines", "plots")
     handles = [lines.Line2D([], [], color=_color(methods, m), label=m) for m in methods]
     handles.append(lines.Line2D([], [], color="0.4", linestyle=":", marker=".", label="unfinished"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    fit = int(figure.get_figwidth() / _LEGEND_WIDTH)
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), fit))
 
 
 def _color(methods: Sequence[str], method: str) -> str:

@@ -1,4 +1,4 @@
-"""A folder of runs as rows, statistics over seeds, and tables."""
+"""A folder of runs as rows, and tables of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..common.extras import MissingExtra, need
+from ..common.extras import MissingExtra
 from ..common.files import atomic_write
 from ..envs import TASKS
 from ..runs.run_folder import CONFIG, RESULT, read_result, trained_steps
@@ -20,13 +20,16 @@ from ..settings.methods import METHODS
 from ..settings.presets import load_config
 from .cells import task_name
 from .ledger import ATTEMPTS, read_grid
+from .statistics import (
+    Estimate,
+    interquartile_means,
+    probabilities_of_improvement,
+    quartiles,
+)
 
 FINISHED, FAILED, UNFINISHED, NOT_RUN = "finished", "failed", "unfinished", "not run"
 
 TABLE_CSV, TABLE_MD = "table.csv", "table.md"
-
-_BOOTSTRAP_SAMPLES = 2000
-_BOOTSTRAP_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -150,49 +153,16 @@ def ordered(known: Iterable[str], found: Iterable[str]) -> list[str]:
     return first + sorted(names - set(first))
 
 
-def quartiles(values: np.ndarray) -> tuple[float, float, float]:
-    """Return the 25%, 50% and 75% quantiles of values (n,), n >= 1."""
-    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-    return float(low), float(middle), float(high)
-
-
-def interquartile_means(
-    scores: dict[Any, np.ndarray],
-) -> dict[Any, tuple[float, float, float]]:
-    """Return IQM and 95% interval by a bootstrap stratified over tasks (Agarwal et al. 2021).
-
-    Args:
-        scores: success rates (seeds, tasks), by any key; one seed has an interval of width 0,
-            which says nothing.
-
-    Raises:
-        MissingExtra: rliable is not installed.
-    """
-    library, metrics = need("rliable.library", "plots"), need("rliable.metrics", "plots")
-    earlier = np.random.get_state()  # rliable draws from NumPy's global stream
-    np.random.seed(_BOOTSTRAP_SEED)
-    try:
-        points, intervals = library.get_interval_estimates(
-            scores, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=_BOOTSTRAP_SAMPLES
-        )
-    finally:
-        np.random.set_state(earlier)
-    return {
-        key: (float(points[key][0]), float(intervals[key][0][0]), float(intervals[key][1][0]))
-        for key in scores
-    }
-
-
-def across_tasks(groups: Sequence[Group]) -> tuple[list[str], int, dict[str, np.ndarray]]:
-    """Return what methods can be compared on: tasks and seeds that all of them have.
+def common_runs(groups: Sequence[Group]) -> tuple[list[str], dict[str, list[list[Run]]]]:
+    """Return what methods can be compared on: the tasks that all of them have finished runs of.
 
     A method that has not finished a single run does not narrow the choice.
 
     Returns:
-        The tasks; the number of seeds, the first ones of each; and by method the success rates
-        (seeds, tasks). Empty where no task is common to two or more methods' finished runs.
+        The tasks, and by method its finished runs, seed by seed one of each task: as many as it
+        has of all of these. Empty where no task is common to two or more methods.
     """
-    finished = {(g.task, g.method): g.success for g in groups if len(g.success)}
+    finished = {(g.task, g.method): g.of(FINISHED) for g in groups if g.of(FINISHED)}
     methods = list(dict.fromkeys(method for _, method in finished))
     tasks = [
         task
@@ -200,13 +170,14 @@ def across_tasks(groups: Sequence[Group]) -> tuple[list[str], int, dict[str, np.
         if all((task, method) in finished for method in methods)
     ]
     if not tasks or len(methods) < 2:
-        return [], 0, {}
-    n = min(len(finished[task, method]) for task in tasks for method in methods)
-    return (
-        tasks,
-        n,
-        {m: np.stack([finished[t, m][:n] for t in tasks], axis=1) for m in methods},
-    )
+        return [], {}
+    of_seeds = {m: zip(*(finished[task, m] for task in tasks), strict=False) for m in methods}
+    return tasks, {method: [list(runs) for runs in seeds] for method, seeds in of_seeds.items()}
+
+
+def success_rates(runs: Sequence[Sequence[Run]]) -> np.ndarray:
+    """Return the final success rates of `common_runs`, shape (seeds, tasks)."""
+    return np.array([[run.success_rate for run in seed] for seed in runs], dtype=np.float64)
 
 
 def table_rows(groups: Sequence[Group]) -> list[dict[str, Any]]:
@@ -284,19 +255,34 @@ def _cell(group: Group) -> str:
 
 
 def _aggregate_lines(groups: Sequence[Group]) -> list[str]:
-    tasks, n, scores = across_tasks(groups)
+    """Return what holds across tasks: a line a method, and what it is taken over."""
+    tasks, runs = common_runs(groups)
     if not tasks:
         return []
+    scores = {method: success_rates(seeds) for method, seeds in runs.items()}
+    first = next(iter(scores))
     try:
         means = interquartile_means(scores)
+        better = probabilities_of_improvement(scores, first)
     except MissingExtra as error:
         return ["", f"No interquartile means: {error}."]
-    lines = ["", "| method | IQM | 95% interval |", "|---|---|---|"]
-    for method, (mean, low, high) in means.items():
-        interval = f"[{low:.2f}, {high:.2f}]" if n > 1 else "one seed"
-        lines.append(f"| {method} | {mean:.2f} | {interval} |")
-    what = f"{', '.join(tasks)}; {n} seed{'s' if n > 1 else ''} each"
-    return [*lines, "", f"Interquartile mean over the tasks that all of these ran: {what}."]
+    lines = ["", f"| method | seeds | IQM | better than {first} |", "|---|---|---|---|"]
+    for method, values in scores.items():
+        n = len(values)
+        both = min(n, len(scores[first]))
+        other = _estimate(better[method], both) if method != first else ""
+        lines.append(f"| {method} | {n} | {_estimate(means[method], n)} | {other} |")
+    return [
+        *lines,
+        "",
+        f"Interquartile mean, and probability that a run is better than one of {first}, with 95% "
+        f"intervals from two seeds on, over the tasks that all of these ran: {', '.join(tasks)}.",
+    ]
+
+
+def _estimate(estimate: Estimate, n_seeds: int) -> str:
+    interval = f" [{estimate.low:.2f}, {estimate.high:.2f}]" if n_seeds > 1 else ""
+    return f"{estimate.value:.2f}{interval}"
 
 
 def _failure_lines(groups: Sequence[Group]) -> list[str]:

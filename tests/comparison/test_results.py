@@ -11,12 +11,12 @@ from result_folders import write_grid, write_run
 
 from sb3_follow_object.common import extras
 from sb3_follow_object.comparison.results import (
-    across_tasks,
+    common_runs,
     csv_table,
     group_runs,
-    interquartile_means,
     markdown_table,
     read_results,
+    success_rates,
     table_rows,
     write_tables,
 )
@@ -87,34 +87,31 @@ def test_groups_without_runs_are_asked_for(results: Path) -> None:
     assert "rival" in csv_table(groups)
 
 
-def test_methods_are_compared_on_tasks_and_seeds_that_all_have(tmp_path: Path) -> None:
+def test_methods_are_compared_on_tasks_that_all_have(tmp_path: Path) -> None:
     for seed in range(3):
         write_run(tmp_path, "PnPShelf", "fo", seed, 0.1 * seed)
+        write_run(tmp_path, "PnPObstacle", "fo", seed, 0.4)
         write_run(tmp_path, "PushSideGap", "fo", seed, 0.5)
     for seed in range(2):
         write_run(tmp_path, "PnPShelf", "her", seed, 0.2 * seed)
-    tasks, n_seeds, scores = across_tasks(group_runs(read_results(tmp_path)))
-    assert (tasks, n_seeds) == (["PnPShelf"], 2)
-    np.testing.assert_allclose(scores["fo"], [[0.0], [0.1]])
-    np.testing.assert_allclose(scores["her"], [[0.0], [0.2]])
+    for seed in range(3):
+        write_run(tmp_path, "PnPObstacle", "her", seed, 0.3)
+    tasks, runs = common_runs(group_runs(read_results(tmp_path)))
+    assert tasks == ["PnPObstacle", "PnPShelf"]
+    np.testing.assert_allclose(success_rates(runs["fo"]), [[0.4, 0.0], [0.4, 0.1], [0.4, 0.2]])
+    np.testing.assert_allclose(success_rates(runs["her"]), [[0.3, 0.0], [0.3, 0.2]])
 
 
-def test_interquartile_mean_leaves_the_outer_quarters_out() -> None:
+def test_table_compares_each_method_with_the_first(tmp_path: Path) -> None:
     pytest.importorskip("rliable", reason="rliable is not installed")
-    state = np.random.get_state()[1]
-    scores = np.array([[0.0], [0.4], [0.6], [1.0]])
-    mean, low, high = interquartile_means({"fo": scores})["fo"]
-    assert mean == pytest.approx(0.5)
-    assert 0.0 <= low < mean < high <= 1.0
-    assert interquartile_means({"fo": scores})["fo"] == (mean, low, high), "not repeatable"
-    np.testing.assert_array_equal(np.random.get_state()[1], state)
-
-
-def test_bootstrap_is_stratified() -> None:
-    pytest.importorskip("rliable", reason="rliable is not installed")
-    # Within a task the seeds agree, so only a bootstrap that mixed the tasks would vary.
-    scores = np.array([[0.1, 0.2, 0.8, 0.9]] * 3)
-    assert interquartile_means({"fo": scores})["fo"] == pytest.approx((0.5, 0.5, 0.5))
+    for seed, (fo, her) in enumerate([(0.9, 0.5), (0.8, 0.9)]):
+        write_run(tmp_path, "PnPShelf", "fo", seed, fo)
+        write_run(tmp_path, "PnPShelf", "her", seed, her)
+    write_run(tmp_path, "PnPShelf", "rnd", 0, 0.95)
+    text = markdown_table(group_runs(read_results(tmp_path)))
+    assert "| fo | 2 | 0.85 [0.80, 0.90] |  |" in text
+    assert "| her | 2 | 0.70 [0.50, 0.90] | 0.38 [0.00, 1.00] |" in text
+    assert "| rnd | 1 | 0.95 | 1.00 |" in text, "an interval of one seed says nothing"
 
 
 def test_tables_do_without_rliable(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
