@@ -1,11 +1,13 @@
-"""Collect finished run folders into benchmarks/results: one row and two small files a run.
+"""Collect run folders, and write the tables and figures of all that have been collected.
 
     python benchmarks/collect.py runs/*
 
-A run takes the place of one of the same task, method and seed. Its policy, configuration, versions
-and learning curve are copied: `sb3-follow-object evaluate benchmarks/results/<run>` tests it again;
-runs of benchmarks/stock_sb3.py have no policy file. Everything else is made of the copied
-runs: summary.csv, the table of docs/results.md (medians over seeds), the figures.
+A run takes the place of one of the same task, method and seed in benchmarks/results, or in
+benchmarks/robots/results where the environment is of others. Its configuration, versions and
+learning curve are copied. Seed 0 of FO and of HER with reaching, on this package's tasks, keeps its
+policy, with 16 bits a weight where the final test comes out the same, and its predictor:
+`sb3-follow-object evaluate benchmarks/results/<run>` makes the test again. A run that was stopped
+has no final test, and the tables say so. Runs of benchmarks/stock_sb3.py have a curve and a result.
 """
 
 from __future__ import annotations
@@ -14,120 +16,279 @@ import argparse
 import csv
 import json
 import shutil
+from collections.abc import Callable, Iterable
 from itertools import groupby
 from pathlib import Path
 from statistics import median
+from typing import Any
 
+import torch as th
+
+from sb3_follow_object.common.array_trees import load_tree, save_tree
+from sb3_follow_object.comparison.cells import file_name, task_name
 from sb3_follow_object.comparison.cross import CROSS_TESTS
 from sb3_follow_object.comparison.figures import draw_results
 from sb3_follow_object.comparison.plots import draw_curves
-from sb3_follow_object.comparison.results import read_results, write_tables
+from sb3_follow_object.comparison.results import ordered, read_results, write_tables
+from sb3_follow_object.envs import TASKS
+from sb3_follow_object.imagination.goal_predictor import GoalPredictor
+from sb3_follow_object.runs.evaluation import evaluate
+from sb3_follow_object.runs.run_folder import POLICY, noted_command
+from sb3_follow_object.settings.presets import load_config
 
-RESULTS = Path(__file__).parent / "results"
-PAGE = Path(__file__).parents[1] / "docs" / "results.md"
+HERE = Path(__file__).parent
+RESULTS, DOCS = HERE / "results", HERE.parent / "docs"
+OF_OTHERS = HERE / "robots" / "results"  # runs on environments that need not be installed
+README = HERE.parent / "README.md"
 BEGIN, END = "<!-- results: python benchmarks/collect.py -->\n", "<!-- end of results -->"
-COLUMNS = (
-    "task",
-    "method",
-    "seed",
-    "env_steps",
-    "object_steps",
-    "test_steps",
-    "wall_s",
-    "success_rate",
-    "episodes",
-    "command",
-    "commit",
-)
-# The curves of docs/results.md, of all seeds of FO and HER.
+STEPS = ("env_steps", "object_steps", "test_steps")
+COLUMNS = ("task", "method", "seed", *STEPS)
+COLUMNS += ("wall_s", "success_rate", "episodes", "command", "commit")
+KEPT = ("config.json", "result.json", "versions.json", "evaluations.csv", CROSS_TESTS)
+WITH_POLICY = ("fo", "rher")
+PREDICTOR = "predictor"
+ENOUGH = 0.9
+NAMES = {"fo": "FO", "her": "HER", "rher": "HER + reaching", "fo-sldr": "FO + SLDR"}
+# The curves of the docs, of all seeds.
 FEATURED = {"PnPSimpleV2": "pnp-simple-v2.png", "PnPShelf": "pnp-shelf.png"}
-FO_AND_HER = ("fo", "her")
-KEPT = ("config.json", "result.json", "versions.json", "evaluations.csv", "policy.safetensors")
+COMPARED = ("fo", "rher", "her")
+
+Row = dict[str, Any]
 
 
-def read_row(run: Path) -> dict[str, str]:
-    """Return a finished run's row of summary.csv."""
-    result = json.loads((run / "result.json").read_text())
+def read_row(run: Path) -> Row:
+    """Return what a run came to; one that was stopped has no success_rate."""
     versions = json.loads((run / "versions.json").read_text())
-    result["commit"] = versions["commit"]
-    result["success_rate"] = round(result["success_rate"], 4)
-    return {column: str(result[column]) for column in COLUMNS}
+    row: Row = {"commit": versions["commit"], "validations": read_validations(run)}
+    if (run / "config.json").exists():
+        config = json.loads((run / "config.json").read_text())
+        row |= {"task": task_name(config["env_id"]), "command": noted_command(run)}
+        row |= {name: config[name] for name in ("method", "seed")}
+    if (run / "result.json").exists():
+        row |= json.loads((run / "result.json").read_text())
+    elif row["validations"]:
+        row |= {k: row["validations"][-1].get(k) for k in ("env_steps", "object_steps", "wall_s")}
+    return {**row, "task": row["task"].rpartition(":")[2]}
 
 
-def keep_files(run: Path) -> None:
-    """Copy what evaluating and plotting a run again needs."""
+def read_validations(run: Path) -> list[dict[str, float]]:
+    """Return the rows of a run's learning curve."""
+    if not (run / "evaluations.csv").exists():
+        return []
+    with open(run / "evaluations.csv", newline="") as file:
+        return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file)]
+
+
+def folder_of(row: Row) -> Path:
+    """Return where a run is kept."""
+    folder = RESULTS if row["task"] in TASKS else OF_OTHERS
+    return folder / f"{file_name(row['task'])}-{row['method']}-{row['seed']}"
+
+
+def keep(run: Path) -> None:
+    """Copy what plotting a run, and of some runs evaluating it, takes."""
     row = read_row(run)
-    target = RESULTS / f"{row['task']}-{row['method']}-{row['seed']}"
+    target = folder_of(row)
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
-    for name in (*KEPT, CROSS_TESTS):
+    for name in KEPT:
         if (run / name).exists():
             shutil.copyfile(run / name, target / name)
+    if "success_rate" not in row:
+        (target / "command.txt").write_text(f"{row['command']}\n")
+    elif row["method"] in WITH_POLICY and row["seed"] == 0 and row["task"] in TASKS:
+        keep_policy(run, target, row)
 
 
-Rows = list[dict[str, str]]
+def keep_policy(run: Path, target: Path, row: Row) -> None:
+    """Copy policy and predictor, with 16 bits a weight unless the policy's test then differs."""
+    save_tree(target / POLICY, halved(load_tree(run / POLICY)))
+    env_id = load_config(run).env_id
+    tested = evaluate(target / POLICY, env_id, row["episodes"], row["seed"])
+    if tested.success_rate != row["success_rate"]:
+        print(f"{target.name}: with 16 bits a weight {tested.success_rate:.4f}; kept with 32")
+        shutil.copyfile(run / POLICY, target / POLICY)
+    if (run / PREDICTOR).exists():
+        GoalPredictor.load(run / PREDICTOR).save(target / PREDICTOR, half=True)
 
 
-def middle(rows: Rows, column: str) -> float:
-    """Return a column's median over seeds."""
-    return median(float(row[column]) for row in rows)
+def halved(tree: Any) -> Any:
+    """Return a tree whose weights have 16 bits."""
+    if isinstance(tree, dict):
+        return {name: halved(value) for name, value in tree.items()}
+    return tree.half() if isinstance(tree, th.Tensor) and tree.dtype == th.float32 else tree
 
 
-def full_table(rows: Rows) -> str:
-    """Return the results as a Markdown table, a line for each task and method."""
+def first_good(row: Row) -> dict[str, float] | None:
+    """Return the first validation that is good enough."""
+    return next((v for v in row["validations"] if v["success_rate"] >= ENOUGH), None)
+
+
+def reached(rows: Iterable[Row], column: str) -> float | None:
+    """Return the median over runs of env_steps or wall_s at 0.9; None if half did not get there."""
+    found = [(first_good(row) or {}).get(column, float("inf")) for row in rows]
+    middle = median(found)
+    return None if middle == float("inf") else middle
+
+
+def steps_and_minutes(rows: list[Row]) -> tuple[str, str]:
+    """Return after how many env steps and minutes 0.9 succeeded, in words."""
+    steps, seconds = reached(rows, "env_steps"), reached(rows, "wall_s")
+    return (
+        "not yet" if steps is None else f"{steps:,.0f}",
+        "" if seconds is None else f"{seconds / 60:.0f}",
+    )
+
+
+def in_the_end(rows: list[Row]) -> str:
+    """Return the final success of several seeds, in words."""
+    final = sorted(row["success_rate"] for row in rows if "success_rate" in row)
+    stopped = [row["validations"][-1] for row in rows if "success_rate" not in row]
+    said = [f"{median(final):.2f}"] if final else []
+    if len(final) > 1:
+        said = [f"{said[0]} ({final[0]:.2f} to {final[-1]:.2f})"]
+    said += [f"{v['success_rate']:.2f} of {v['episodes']:.0f}, stopped" for v in stopped]
+    return "; ".join(said)
+
+
+def end_and_steps(rows: list[Row]) -> tuple[str, str]:
+    """Return the final success of several seeds, and when it was, in words."""
+    return in_the_end(rows), f"{median(float(row['env_steps']) for row in rows):,.0f}"
+
+
+def name_of(method: str) -> str:
+    """Return a method's name in the tables."""
+    return NAMES.get(method, method.upper())
+
+
+def seeds(rows: list[Row]) -> str:
+    """Return the seeds of several runs."""
+    return ", ".join(str(row["seed"]) for row in rows)
+
+
+def table(head: tuple[str, ...], lines: Iterable[tuple[str, ...]]) -> str:
+    """Return a table in Markdown."""
+    rows = (head, ("---",) * len(head), *lines)
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in rows)
+
+
+def groups(rows: list[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Return the runs of each task and method."""
+    return {key: list(found) for key, found in groupby(rows, lambda r: (r["task"], r["method"]))}
+
+
+def small_table(rows: list[Row]) -> str:
+    """Return README's table, a line a task."""
+    head = ("task", "FO: 0.9 after env steps", "minutes", "seeds")
+    lines = []
+    for task in TASKS:
+        found = groups(rows)
+        fo = found.get((task, "fo"), [])
+        of_fo = (*steps_and_minutes(fo), seeds(fo)) if fo else ("not run", "", "")
+        ends = (in_the_end(found.get((task, method), [])) or "not run" for method in COMPARED)
+        lines.append((task, *of_fo, *ends))
+    return table((*head, *(f"{NAMES[m]} in the end" for m in COMPARED)), lines)
+
+
+def full_table(rows: list[Row]) -> str:
+    """Return the table of docs/results.md, a line a task and method."""
+    head = ("task", "method", "seeds", "0.9 after env steps", "minutes", "in the end")
     lines = [
-        "| task | method | seeds | env steps | minutes | success |",
-        "|---|---|---|---|---|---|",
+        (task, name_of(method), seeds(runs), *steps_and_minutes(runs), *end_and_steps(runs))
+        for (task, method), runs in groups(rows).items()
+        if task in TASKS
     ]
-    for (task, method), group in groupby(rows, key=lambda row: (row["task"], row["method"])):
-        runs = list(group)
-        seeds = ", ".join(row["seed"] for row in runs)
-        steps, minutes = middle(runs, "env_steps"), middle(runs, "wall_s") / 60
-        success = f"{middle(runs, 'success_rate'):.2f}"
-        cells = (task, method.upper(), seeds, f"{steps:,.0f}", f"{minutes:.0f}", success)
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    return table((*head, "at env steps"), lines)
 
 
-def with_table(text: str, table: str) -> str:
+def reaching_table(rows: list[Row]) -> str:
+    """Return the table of docs/reaching.md: what imagined goals add to reaching, task by task."""
+    found = groups(rows)
+    lines = []
+    for task in TASKS:
+        of_task = {m: found[task, m] for m in COMPARED if (task, m) in found}
+        if len(of_task) < 2:
+            continue
+        cells = []
+        for method in COMPARED:
+            runs = of_task.get(method)
+            after = reached(runs, "env_steps") if runs else None
+            steps = f", 0.9 after {after:,.0f}" if after is not None else ""
+            cells.append(f"{in_the_end(runs)}{steps}" if runs else "not run")
+        budget = median(float(row["env_steps"]) for row in found[task, "fo"])
+        lines.append((task, f"{budget:,.0f}", *cells))
+    return table(("task", "env steps of FO", *(NAMES[m] for m in COMPARED)), lines)
+
+
+def robots_table(rows: list[Row]) -> str:
+    """Return the table of docs/robots.md, a line a run of an environment of others."""
+    head = ("task", "method", "seed", "0.9 after env steps", "minutes", "in the end")
+    lines = [
+        (task, name_of(method), seeds([row]), *steps_and_minutes([row]), *end_and_steps([row]))
+        for (task, method), runs in groups(rows).items()
+        for row in runs
+        if task not in TASKS
+    ]
+    return table((*head, "at env steps"), lines)
+
+
+PAGES: dict[Path, Callable[[list[Row]], str]] = {
+    README: small_table,
+    DOCS / "results.md": full_table,
+    DOCS / "reaching.md": reaching_table,
+    DOCS / "robots.md": robots_table,
+}
+
+
+def with_table(text: str, written: str) -> str:
     """Return a page with the table between its marks written anew."""
     head, rest = text.split(BEGIN)
-    return head + BEGIN + table + END + rest.split(END)[1]
+    return head + BEGIN + written + END + rest.split(END)[1]
 
 
-def write_page(rows: Rows) -> None:
-    """Write the table of the docs."""
-    PAGE.write_text(with_table(PAGE.read_text(), full_table(rows)))
+def read_rows() -> list[Row]:
+    """Return all runs that are kept: this package's tasks first, in their order."""
+    kept = [*RESULTS.glob("*/versions.json"), *OF_OTHERS.glob("*/versions.json")]
+    rows = [read_row(file.parent) for file in kept]
+    tasks = ordered(TASKS, (row["task"] for row in rows))
+    return sorted(rows, key=lambda row: (tasks.index(row["task"]), row["method"], row["seed"]))
+
+
+def write_summary(rows: list[Row]) -> None:
+    """Write a line a run; one that was stopped has no success_rate."""
+    with open(RESULTS / "summary.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n", extrasaction="ignore")
+        writer.writeheader()
+        for row in rows:
+            numbers = {
+                k: int(row[k]) for k in ("env_steps", "object_steps", "test_steps") if row.get(k)
+            }
+            rate = {"success_rate": round(row["success_rate"], 4)} if "success_rate" in row else {}
+            writer.writerow({**row, **numbers, **rate})
+
+
+def draw(rows: list[Row]) -> None:
+    """Write the tables of `compare`, its figures and the curves of the docs."""
+    write_tables(read_results(RESULTS), RESULTS)
+    draw_results(RESULTS, RESULTS / "figures")
+    for task, name in FEATURED.items():
+        wanted = [row for row in rows if row["task"] == task and row["method"] in COMPARED]
+        draw_curves([folder_of(row) for row in wanted], RESULTS / name)
 
 
 def main() -> None:
     """Collect the runs named on the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("runs", nargs="*", type=Path, help="finished run folders")
-    runs = parser.parse_args().runs
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("runs", nargs="*", type=Path, help="run folders")
     RESULTS.mkdir(exist_ok=True)
-    for run in runs:
-        if (run / "result.json").exists():
-            keep_files(run)
-        else:
-            print(f"{run}: not finished, left out")
-    ordered = sorted(
-        (read_row(file.parent) for file in RESULTS.glob("*/result.json")),
-        key=lambda row: (row["task"], row["method"], row["seed"]),
-    )
-    summary = RESULTS / "summary.csv"
-    with open(summary, "w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(ordered)
-    write_tables(read_results(RESULTS), RESULTS)
-    draw_results(RESULTS, RESULTS / "figures")
-    for task, name in FEATURED.items():
-        wanted = [row for row in ordered if row["task"] == task and row["method"] in FO_AND_HER]
-        folders = [RESULTS / "-".join((r["task"], r["method"], r["seed"])) for r in wanted]
-        draw_curves(folders, RESULTS / name)
-    write_page(ordered)
-    print(f"{len(ordered)} rows in {summary}")
+    for run in parser.parse_args().runs:
+        keep(run)
+    rows = read_rows()
+    write_summary(rows)
+    for page, text in PAGES.items():
+        page.write_text(with_table(page.read_text(), text(rows)))
+    draw(rows)
+    print(f"{len(rows)} runs in {RESULTS}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Train a small network for long and watch the process: memory, open files, threads.
 
-    python benchmarks/long_run.py --steps 5000000 --out benchmarks/results/long_run
+    python benchmarks/long_run.py --steps 5000000 --out benchmarks/long_run
 
 Writes OUT.csv with a sample every few seconds and OUT.png. Once the replay buffer is full nothing
 may grow: exit code 1 where the last quarter of the samples holds over 2% more memory, or more files

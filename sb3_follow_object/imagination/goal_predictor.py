@@ -283,15 +283,24 @@ class GoalPredictor(WholeCopies):
         ahead = ahead.reshape(-1, self.horizon, self.space.size)
         return np.concatenate([start[:, None], ahead], axis=1)
 
-    def save(self, folder: str | os.PathLike[str]) -> None:
+    def save(self, folder: str | os.PathLike[str], half: bool = False) -> None:
         """Write ``predictor.safetensors`` and ``predictor.json`` into ``folder``.
 
         The facts come last and name the tensors' digest, so a pair that does not belong together
         is noticed when it is loaded.
+
+        Args:
+            folder: is created where it does not exist.
+            half: write the weights as float16, which halves the file and rounds them.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        tensors = safetensors.torch.save(self._tensors)
+        tensors = safetensors.torch.save(
+            {
+                name: value.half() if half and name not in SCALES else value
+                for name, value in self._tensors.items()
+            }
+        )
         facts = {
             "format": FORMAT,
             "env_id": self.env_id,

@@ -87,6 +87,8 @@ def checked_tensors(
 ) -> dict[str, torch.Tensor]:
     """Return a predictor's weights, float32, and scales, float64, by their names.
 
+    The file may hold the weights as float16.
+
     Args:
         path: of the safetensors file.
         goals: what they are.
@@ -115,6 +117,10 @@ def checked_tensors(
         tensors = safetensors.torch.load(data)
     except SafetensorError as error:
         raise ValueError(f"{path} is not a safetensors file ({error}).") from error
+    tensors = {
+        name: value.float() if value.dtype == torch.float16 else value
+        for name, value in tensors.items()
+    }
     found = {name: (tuple(value.shape), value.dtype) for name, value in tensors.items()}
     if found != expected:
         raise ValueError(f"{path} does not hold the tensors of hidden layers {list(hidden)}.")

@@ -2,11 +2,11 @@
 
 import csv
 import importlib.util
-import json
 import re
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from pages import PAGES, anchors, links
@@ -93,19 +93,35 @@ def benchmark(name: str) -> ModuleType:
     return module
 
 
-def test_the_table_of_results_is_the_collected_one() -> None:
+def test_tables_of_results_are_of_the_runs_that_are_kept() -> None:
     collect = benchmark("collect")
+    rows = collect.read_rows()
+    assert len(collect.PAGES) == 4
+    for page, table in collect.PAGES.items():
+        assert collect.with_table(page.read_text(), table(rows)) == page.read_text()
     with open(collect.RESULTS / "summary.csv", newline="") as file:
-        table = collect.full_table(list(csv.DictReader(file)))
-    assert collect.with_table(collect.PAGE.read_text(), table) == collect.PAGE.read_text()
+        named = [(row["task"], row["method"], int(row["seed"])) for row in csv.DictReader(file)]
+    assert named == [(row["task"], row["method"], row["seed"]) for row in rows]
 
 
-def test_the_tables_of_the_recipe_are_the_kept_ones() -> None:
-    recipe = benchmark("recipe")
-    rows = json.loads((recipe.KEPT / "runs.json").read_text())
-    assert len(recipe.tables(rows)) == 3
-    for page, table in recipe.tables(rows).items():
-        assert recipe.with_table(page.read_text(), table) == page.read_text()
+def test_tables_say_what_was_stopped_or_not_run() -> None:
+    collect = benchmark("collect")
+
+    def row(seed: int, *success: float, final: float | None = None) -> dict[str, Any]:
+        seen = [
+            {"env_steps": 1000.0 * n, "wall_s": 60.0 * n, "success_rate": rate, "episodes": 76.0}
+            for n, rate in enumerate(success, start=1)
+        ]
+        named = {"task": "PnPShelf", "method": "fo", "seed": seed, "env_steps": 5000}
+        return {**named, "validations": seen, **({} if final is None else {"success_rate": final})}
+
+    runs = [row(0, 0.1, 0.95, final=0.9), row(1, 0.2, 0.3, 0.92, final=0.97), row(2, 0.0, 0.4)]
+    line = next(line for line in collect.small_table(runs).splitlines() if "PnPShelf" in line)
+    cells = line.strip("| ").split(" | ")
+    assert cells[1:4] == ["3,000", "3", "0, 1, 2"], "a run that is not there counts as the last"
+    assert cells[4] == "0.94 (0.90 to 0.97); 0.40 of 76, stopped"
+    assert cells[5:] == ["not run", "not run"]
+    assert "| not yet |" in collect.full_table(runs[2:])
 
 
 def test_readme_is_a_page() -> None:

@@ -161,6 +161,18 @@ def test_saving_and_loading_keeps_everything(predictor: GoalPredictor, tmp_path:
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [FACTS_FILE, TENSORS_FILE]
 
 
+def test_half_the_bytes_imagine_nearly_the_same(predictor: GoalPredictor, tmp_path: Path) -> None:
+    predictor.save(tmp_path / "whole")
+    predictor.save(tmp_path / "half", half=True)
+    whole, half = ((tmp_path / name / TENSORS_FILE).stat().st_size for name in ("whole", "half"))
+    assert half < 0.6 * whole
+    loaded = GoalPredictor.load(tmp_path / "half", env_id="Toy-v0", physics="abc")
+    np.testing.assert_allclose(loaded.predict(*query(30)), predictor.predict(*query(30)), atol=2e-3)
+    loaded.save(tmp_path / "again", half=True)
+    same = (tmp_path / "again" / TENSORS_FILE).read_bytes()
+    assert same == (tmp_path / "half" / TENSORS_FILE).read_bytes()
+
+
 def test_a_predictor_for_another_task_or_physics_is_refused(
     predictor: GoalPredictor, tmp_path: Path
 ) -> None:

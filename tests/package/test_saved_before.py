@@ -85,8 +85,8 @@ def folders_of(name: str) -> list[Path]:
 
 def test_every_result_of_the_benchmarks_loads() -> None:
     spaces: dict[str, tuple[Any, Any]] = {}
-    folders = folders_of("config.json")
-    assert len(folders) > 30
+    folders = folders_of("policy.safetensors")
+    assert folders
     for folder in folders:
         config = load_config(folder)
         if config.env_id not in spaces:
@@ -102,7 +102,7 @@ def test_every_result_of_the_benchmarks_loads() -> None:
 
 def test_every_predictor_of_the_benchmarks_loads() -> None:
     folders = folders_of("predictor.json")
-    assert len(folders) > 10
+    assert folders
     for folder in folders:
         config = json.loads((folder.parent / "config.json").read_text())
         predictor = GoalPredictor.load(folder, env_id=config["env_id"])
