@@ -205,7 +205,9 @@ def test_the_command_names_every_setting_with_range_and_default() -> None:
 
 
 @pytest.mark.parametrize(
-    "folder", sorted((ROOT / "benchmarks").rglob("config.json")), ids=lambda path: path.parent.name
+    "folder",
+    sorted((ROOT / "benchmarks" / "results").rglob("config.json")),
+    ids=lambda path: path.parent.name,
 )
 def test_configurations_of_earlier_runs_load_as_they_are(folder: Path) -> None:
     saved = json.loads(folder.read_text())
