@@ -27,7 +27,7 @@ import torch as th
 from sb3_follow_object.common.array_trees import load_tree, save_tree
 from sb3_follow_object.comparison.cells import file_name, task_name
 from sb3_follow_object.comparison.cross import CROSS_TESTS
-from sb3_follow_object.comparison.figures import draw_results
+from sb3_follow_object.comparison.figures import draw_methods, draw_results
 from sb3_follow_object.comparison.plots import draw_curves
 from sb3_follow_object.comparison.results import ordered, read_results, write_tables
 from sb3_follow_object.envs import TASKS
@@ -271,6 +271,7 @@ def draw(rows: list[Row]) -> None:
     """Write the tables of `compare`, its figures and the curves of the docs."""
     write_tables(read_results(RESULTS), RESULTS)
     draw_results(RESULTS, RESULTS / "figures")
+    draw_methods(RESULTS, RESULTS / "figures" / "reaching.png", COMPARED)
     for task, name in FEATURED.items():
         wanted = [row for row in rows if row["task"] == task and row["method"] in COMPARED]
         draw_curves([folder_of(row) for row in wanted], RESULTS / name)

@@ -80,6 +80,29 @@ def draw_results(
     return [out / name for name in figures]
 
 
+def draw_methods(
+    results: str | os.PathLike[str], out: str | os.PathLike[str], methods: Sequence[str]
+) -> None:
+    """Draw learning curves of these methods alone, a panel for each task that two of them ran.
+
+    Args:
+        results: as in `draw_results`.
+        out: PNG file to create or replace.
+        methods: two or more.
+
+    Raises:
+        MissingExtra: matplotlib is not installed.
+        ValueError: the folder holds no runs, or no task has runs of two of the methods.
+    """
+    runs = [run for run in read_results(results) if run.method in methods]
+    seen = [run for run in runs if run.status in (FINISHED, UNFINISHED)]
+    ran = {task: {run.method for run in seen if run.task == task} for task in TASKS}
+    tasks = [task for task in TASKS if len(ran[task]) > 1]
+    if not tasks:
+        raise ValueError(f"no task in {results} has runs of two of {', '.join(methods)}")
+    save_png(_curves(group_runs(runs, tasks, methods), methods, tasks, "env_steps"), out, dpi=110)
+
+
 def _pnp_simple(groups: Sequence[Group], methods: Sequence[str]) -> Any:
     """Return the paper's figure on PnP-Simple: HER's cross test, and all methods on both."""
     figure, axes = _figure(1, 3)

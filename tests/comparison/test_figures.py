@@ -17,6 +17,7 @@ from sb3_follow_object.comparison.figures import (
     FINAL_SUCCESS,
     OTHER_TASKS,
     PNP_SIMPLE,
+    draw_methods,
     draw_results,
 )
 from sb3_follow_object.envs import TASKS
@@ -123,6 +124,19 @@ def test_methods_are_compared_across_tasks(tmp_path: Path, drawn: list[Figure]) 
     # Validated 0.1, 0.2 and 0.4 up to 900 env steps, tested at 1,000, of the 300,000 of the preset.
     assert (fo[0], fo[1], fo[-1]) == pytest.approx((0.0, 0.4, 0.4))
     assert not her.any()
+
+
+def test_methods_are_drawn_alone_where_two_of_them_ran(
+    results: Path, drawn: list[Figure], tmp_path: Path
+) -> None:
+    write_run(results, "PnPSimpleV1", "rher", 0, 0.3)
+    draw_methods(results, tmp_path / "few.png", ("fo", "rher", "her"))
+    (panel,) = [axis for axis in drawn[0].axes if axis.get_title()]
+    assert panel.get_title() == "PnPSimpleV1"
+    assert len(panel.lines) == 2
+    assert [text.get_text() for text in panel.texts] == ["not run: fo"]
+    with pytest.raises(ValueError, match="runs of two of fo, rival"):
+        draw_methods(results, tmp_path / "none.png", ("fo", "rival"))
 
 
 def test_nothing_to_compare_is_said(results: Path, drawn: list[Figure]) -> None:
