@@ -155,6 +155,11 @@ class SingleEnv(_GoalFace, gym.Env):
         reward = float(self.compute_reward(achieved, desired, info))
         return obs, reward, False, fault is not None, info
 
+    @property
+    def window_closed(self) -> bool:
+        """Whether somebody closed the window that "human" opened; steps go on without it."""
+        return self._picture.window_closed
+
     def render(self) -> np.ndarray | None:
         """A picture (480, 480, 3) with "rgb_array"; None, and a window, with "human"."""
         if self.render_mode is None:

@@ -96,6 +96,11 @@ class Picture:
             self._add_shapes(self._window.viewer.user_scn, simulation.goals[index])
         self._window.viewer.sync()
 
+    @property
+    def window_closed(self) -> bool:
+        """Whether the window was opened and somebody closed it."""
+        return self._window is not None and not self._window.viewer.is_running()
+
     def close(self) -> None:
         """Let the graphics go."""
         if _drawn_by not in (None, os.getpid()):

@@ -43,7 +43,11 @@ def run(args: argparse.Namespace) -> None:
     print(f"{env_id}: the policy in {policy.name}, original goals, no noise", flush=True)
     out = args.out
     if out is None and _has_window():
-        rate = _play_in_window(policy, env_id, args.episodes, args.seed, say)
+        try:
+            rate = _play_in_window(policy, env_id, args.episodes, args.seed, say)
+        except _WindowClosed:
+            print("the window was closed")
+            return
     else:
         out = out or Path(f"demo-{_name(args.task)}.mp4")
         if out.suffix.lower() != ".mp4":
@@ -101,13 +105,19 @@ def _play_in_window(policy: Path, env_id: str, n_episodes: int, seed: int, say: 
         env.close()
 
 
+class _WindowClosed(Exception):
+    """Nobody looks any more."""
+
+
 class _Pace:
-    """Waits until a frame's time after the last call is over."""
+    """Waits until a frame's time after the last call is over; raises when the window is closed."""
 
     def __init__(self) -> None:
         self._next = time.monotonic()
 
     def __call__(self, env: Any) -> None:
+        if env.unwrapped.window_closed:
+            raise _WindowClosed
         now = time.monotonic()
         time.sleep(max(0.0, self._next - now))
         self._next = max(self._next, now) + 1.0 / env.metadata["render_fps"]

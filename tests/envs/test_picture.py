@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -11,6 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from sb3_follow_object.command import demo
+from sb3_follow_object.command.cli import main
 from sb3_follow_object.envs import TASKS, picture
 from sb3_follow_object.envs.scene import GRIP_SITE, OBJECT
 
@@ -73,17 +74,46 @@ def test_robot_is_seen_through_while_markers_are_shown() -> None:
     assert (through[320:] == solid[320:]).all()  # the table's front
 
 
-def test_window_shows_the_robot_and_not_the_viewers_panels(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown: dict[str, bool] = {}
+class Viewer:
+    """In place of mujoco.viewer, where there is no screen."""
 
-    def launch_passive(model: Any, data: Any, **panels: bool) -> MagicMock:
-        shown.update(panels)
-        return MagicMock(cam=mujoco.MjvCamera(), user_scn=mujoco.MjvScene(model, 1000))
+    def __init__(self) -> None:
+        self.panels: dict[str, bool] = {}
+        self.running = True
 
-    viewer = SimpleNamespace(launch_passive=launch_passive)
+    def launch_passive(self, model: Any, data: Any, **panels: bool) -> MagicMock:
+        self.panels = panels
+        handle = MagicMock(cam=mujoco.MjvCamera(), user_scn=mujoco.MjvScene(model, 1000))
+        handle.is_running.side_effect = lambda: self.running
+        return handle
+
+
+@pytest.fixture
+def viewer(monkeypatch: pytest.MonkeyPatch) -> Viewer:
+    one = Viewer()
     monkeypatch.setattr(picture, "check_windows", lambda: None)
-    monkeypatch.setattr(picture, "import_module", lambda name: viewer)
+    monkeypatch.setattr(picture, "import_module", lambda name: one)
+    return one
+
+
+def test_window_shows_the_robot_and_not_the_viewers_panels(viewer: Viewer) -> None:
     env = gym.make("FollowObject/PnPShelf-v0", render_mode="human")
     env.reset(seed=0)
     env.close()
-    assert shown == {"show_left_ui": False, "show_right_ui": False}
+    assert viewer.panels == {"show_left_ui": False, "show_right_ui": False}
+
+
+def test_closing_the_window_is_noticed_and_ends_the_demo(
+    viewer: Viewer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    env = gym.make("FollowObject/PnPShelf-v0", render_mode="human")
+    assert not env.unwrapped.window_closed  # there is none yet
+    env.reset(seed=0)
+    assert not env.unwrapped.window_closed
+    viewer.running = False
+    env.step(env.action_space.sample())
+    assert env.unwrapped.window_closed
+    env.close()
+    monkeypatch.setattr(demo, "_has_window", lambda: True)
+    assert main(["demo", "--episodes", "3"]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == ["the window was closed"]
