@@ -151,9 +151,10 @@ def in_the_end(rows: list[Row]) -> str:
     return "; ".join(said)
 
 
-def end_and_steps(rows: list[Row]) -> tuple[str, str]:
-    """Return the final success of several seeds, and when it was, in words."""
-    return in_the_end(rows), f"{median(float(row['env_steps']) for row in rows):,.0f}"
+def end_and_cost(rows: list[Row]) -> tuple[str, str, str]:
+    """Return the final success of several seeds, and after how many env steps and minutes."""
+    steps, seconds = (median(float(row[name]) for row in rows) for name in ("env_steps", "wall_s"))
+    return in_the_end(rows), f"{steps:,.0f}", f"{seconds / 60:.0f}"
 
 
 def name_of(method: str) -> str:
@@ -194,11 +195,11 @@ def full_table(rows: list[Row]) -> str:
     """Return the table of docs/results.md, a line a task and method."""
     head = ("task", "method", "seeds", "0.9 after env steps", "minutes", "in the end")
     lines = [
-        (task, name_of(method), seeds(runs), *steps_and_minutes(runs), *end_and_steps(runs))
+        (task, name_of(method), seeds(runs), *steps_and_minutes(runs), *end_and_cost(runs))
         for (task, method), runs in groups(rows).items()
         if task in TASKS
     ]
-    return table((*head, "at env steps"), lines)
+    return table((*head, "at env steps", "and minutes"), lines)
 
 
 def reaching_table(rows: list[Row]) -> str:
@@ -224,12 +225,12 @@ def robots_table(rows: list[Row]) -> str:
     """Return the table of docs/robots.md, a line a run of an environment of others."""
     head = ("task", "method", "seed", "0.9 after env steps", "minutes", "in the end")
     lines = [
-        (task, name_of(method), seeds([row]), *steps_and_minutes([row]), *end_and_steps([row]))
+        (task, name_of(method), seeds([row]), *steps_and_minutes([row]), *end_and_cost([row]))
         for (task, method), runs in groups(rows).items()
         for row in runs
         if task not in TASKS
     ]
-    return table((*head, "at env steps"), lines)
+    return table((*head, "at env steps", "and minutes"), lines)
 
 
 PAGES: dict[Path, Callable[[list[Row]], str]] = {
@@ -271,7 +272,8 @@ def draw(rows: list[Row]) -> None:
     """Write the tables of `compare`, its figures and the curves of the docs."""
     write_tables(read_results(RESULTS), RESULTS)
     draw_results(RESULTS, RESULTS / "figures")
-    draw_methods(RESULTS, RESULTS / "figures" / "reaching.png", COMPARED)
+    if len({row["method"] for row in rows if row["task"] in TASKS} & {*COMPARED}) > 1:
+        draw_methods(RESULTS, RESULTS / "figures" / "reaching.png", COMPARED)
     for task, name in FEATURED.items():
         wanted = [row for row in rows if row["task"] == task and row["method"] in COMPARED]
         draw_curves([folder_of(row) for row in wanted], RESULTS / name)

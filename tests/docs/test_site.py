@@ -112,7 +112,7 @@ def test_tables_say_what_was_stopped_or_not_run() -> None:
             {"env_steps": 1000.0 * n, "wall_s": 60.0 * n, "success_rate": rate, "episodes": 76.0}
             for n, rate in enumerate(success, start=1)
         ]
-        named = {"task": "PnPShelf", "method": "fo", "seed": seed, "env_steps": 5000}
+        named = {"task": "PnPShelf", "method": "fo", "seed": seed, "env_steps": 5000, "wall_s": 90}
         return {**named, "validations": seen, **({} if final is None else {"success_rate": final})}
 
     runs = [row(0, 0.1, 0.95, final=0.9), row(1, 0.2, 0.3, 0.92, final=0.97), row(2, 0.0, 0.4)]
