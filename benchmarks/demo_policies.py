@@ -1,9 +1,9 @@
 """Puts the policies of finished runs into the package, for `sb3-follow-object demo`.
 
-    python benchmarks/demo_policies.py                  # of all tasks, from benchmarks/results
+    python benchmarks/demo_policies.py                  # seed 0 of FO, of benchmarks/results
     python benchmarks/demo_policies.py runs/shelf ...   # of these runs' tasks
 
-They are the runs' policy.safetensors as they are: actor and normaliser, float32, without pickle.
+They are the runs' policy.safetensors as they are: actor and normaliser, without pickle.
 """
 
 import argparse
@@ -23,7 +23,8 @@ MOST_BYTES = 6_000_000  # of all together
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    results = [RESULTS / f"{task}-fo-0" for task in TASKS]
+    runs = [RESULTS / f"{task}-fo-0" for task in TASKS]
+    results = [run for run in runs if (run / POLICY).exists()]
     parser.add_argument("runs", type=Path, nargs="*", default=results, metavar="RUN")
     POLICIES.mkdir(exist_ok=True)
     for run in parser.parse_args().runs:

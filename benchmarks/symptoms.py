@@ -2,7 +2,7 @@
 
     python benchmarks/symptoms.py
 
-Reads validations in benchmarks/results and benchmarks/remedies, and in benchmarks/symptoms SB3's
+Reads validations of runs of before 0.2.0 in benchmarks/symptoms and benchmarks/remedies, and SB3's
 log of a run that was stopped after 201,600 env steps: `sb3-follow-object train --env
 FollowObject/PnPSimpleV2-v0 --method her --seed 0 --steps 300000 --threads 1`. Writes
 docs/images/symptoms.
@@ -30,8 +30,8 @@ LEVELS = HERE / "remedies" / "PnPInsertion-small-batch-levels.csv"
 
 
 def validations(run: str) -> Path:
-    """Return the file of a kept run's validations."""
-    return HERE / "results" / run / "evaluations.csv"
+    """Return the file of a run's validations."""
+    return HERE / "symptoms" / f"{run}.csv"
 
 
 def column(file: Path, x: str, y: str) -> Column:

@@ -46,16 +46,18 @@ def test_run_depends_on_its_seed_alone(n_envs: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "task", "n_threads"),
-    [("her", "PnPShelf", 2), ("rnd", "PnPShelf", 3), ("her", "PnPInsertion", 2)],
+    ("method", "batch_size", "n_threads"), [("her", 128, 2), ("rnd", 128, 3), ("her", 1024, 2)]
 )
-def test_threads_of_gradient_steps_change_no_bit(method: str, task: str, n_threads: int) -> None:
-    settings = run_config(f"FollowObject/{task}-v0", method=method).settings["algorithm"]
+def test_threads_of_gradient_steps_change_no_bit(
+    method: str, batch_size: int, n_threads: int
+) -> None:
+    task = "FollowObject/PnPShelf-v0"
+    settings = run_config(task, method=method).settings["algorithm"]
     weights = []
     for threads in (1, n_threads):
-        env = make_vec(f"FollowObject/{task}-v0", 2, 1)
+        env = make_vec(task, 2, 1)
         small = {"learning_starts": 0, "gradient_steps": 5, "buffer_size": 2000}
-        small |= {"update_threads": threads}
+        small |= {"update_threads": threads, "batch_size": batch_size}
         model = HerDDPG(env=env, seed=3, **(settings | small))
         model.learn(200)
         assert model._n_updates == 10
