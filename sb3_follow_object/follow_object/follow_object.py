@@ -74,6 +74,8 @@ class FollowObject:
         object_test_every: rollouts of every copy between two tests of the object's policy.
         object_test_episodes: episodes of such a test.
         object_success: success rate of two such tests in a row that ends the object's stage.
+        object_error: mean error of F_phi, in metres, beyond which the object learns for as many
+            steps again, once; 0, never (paper).
         n_paths: noise-free object paths that F_phi is fitted on.
         predictor_fit: keyword arguments of `GoalPredictor.fit`.
         inverse_fit: keyword arguments of `ObjectNetworks.learned`, about the inverse model.
@@ -117,6 +119,7 @@ class FollowObject:
         object_test_every: int = StageSettings.object_test_every,
         object_test_episodes: int = StageSettings.object_test_episodes,
         object_success: float = StageSettings.object_success,
+        object_error: float = StageSettings.object_error,
         n_paths: int = StageSettings.n_paths,
         predictor_fit: dict[str, Any] | None = None,
         inverse_fit: dict[str, Any] | None = None,
@@ -152,6 +155,7 @@ class FollowObject:
             "object_test_every": object_test_every,
             "object_test_episodes": object_test_episodes,
             "object_success": object_success,
+            "object_error": object_error,
             "n_paths": n_paths,
             "predictor_fit": predictor_fit or {},
             "inverse_fit": inverse_fit or {},

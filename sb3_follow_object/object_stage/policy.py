@@ -90,8 +90,18 @@ class StopWhenSolved(CopyableCallback):
         """Whether the last two tests reached the success rate."""
         return len(self.rates) >= 2 and min(self.rates[-2:]) >= self.success_rate
 
+    @property
+    def learns_on(self) -> bool:
+        """Whether it was told to go on once though the task was solved."""
+        return "until" in self.notes
+
+    def learn_on(self, until: int) -> None:
+        """Go on for so many env steps in all, and to the next two tests that reach the rate."""
+        self.notes = {**self.notes, "until": until}
+        self.stopped = False
+
     def _on_step(self) -> bool:
-        self.stopped = self.solved
+        self.stopped = self.solved and self.model.num_timesteps >= self.notes.get("until", 0)
         return not self.stopped
 
     def state_dict(self) -> dict[str, Any]:
@@ -137,6 +147,7 @@ def train_object_policy(
     report: Callable[[int, float], None] | None = None,
     callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
     state: dict[str, Any] | None = None,
+    too_rough: Callable[[HerDDPG, StopWhenSolved], bool] | None = None,
     **algorithm_kwargs: Any,
 ) -> tuple[HerDDPG, StopWhenSolved]:
     """Learn the object policy nu by DDPG + HER and stop as soon as it solves the task.
@@ -152,6 +163,7 @@ def train_object_policy(
         report: called with (env_steps, success rate) after each test.
         callback: makes another callback from the one that tests.
         state: of `StopWhenSolved.state_dict`; training goes on exactly from there.
+        too_rough: asked once, when the task is solved, whether to learn for as many steps again.
         algorithm_kwargs: of HerDDPG.
 
     Returns:
@@ -161,13 +173,26 @@ def train_object_policy(
     model = HerDDPG("MultiInputPolicy", env, seed=seed, **algorithm_kwargs)
     if state is not None:
         solved.load_state_dict(state, model, env)
-    if not solved.stopped:
+    callbacks = CallbackList([solved, *([callback(solved)] if callback else [])])
+
+    def learn(begins: bool) -> None:
         model.learn(
             total_timesteps - model.num_timesteps,
-            callback=CallbackList([solved, *([callback(solved)] if callback else [])]),
+            callback=callbacks,
             log_interval=None,  # type: ignore[arg-type]
-            reset_num_timesteps=state is None,
+            reset_num_timesteps=begins,
         )
+
+    if not solved.stopped:
+        learn(begins=state is None)
+    if (
+        solved.solved
+        and not solved.learns_on
+        and too_rough is not None
+        and too_rough(model, solved)
+    ):
+        solved.learn_on(2 * model.num_timesteps)
+        learn(begins=False)
     return model, solved
 
 

@@ -99,7 +99,7 @@ class ObjectStage:
         state: dict[str, Any] | None = None,
         between_epochs: Callable[[], None] = lambda: None,
         networks: bool = False,
-    ) -> tuple[HerDDPG, StopWhenSolved]:
+    ) -> None:
         """Run stage one (section 4.1): the object policy, and with SLDR the networks that it needs.
 
         Args:
@@ -108,25 +108,8 @@ class ObjectStage:
             between_epochs: called while the inverse model is fitted; may raise to stop.
             networks: whether to make what SLDR needs for others, though this run does not.
         """
-        settings = self.settings
-        self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
-        if sentence := what_is_followed(self.env_id):
-            self.report(f"  {sentence}")
-        model, solved, spent = self._train(callback, state)
-        self.steps = self.policy_steps = spent + model.num_timesteps
-        if networks or self.needs_networks:
-            self.networks = ObjectNetworks.learned(
-                model,
-                self.env_id,
-                physics_of_task(self.env_id),
-                seed=stream_seed(self.seed, "inverse"),
-                between_updates=between_epochs,
-                **settings["inverse_fit"],
-            )
-            error = self.networks.inverse_error
-            self.report(f"  {self.steps} env steps, inverse model's error {error:.3f}")
-        self.success = solved.rates[-1] if solved.rates else float("nan")
-        return model, solved
+        model, _ = self._learn(callback, state, between_epochs, False)
+        self._make_networks(model, between_epochs, networks)
 
     def learn_predictor(
         self,
@@ -143,8 +126,64 @@ class ObjectStage:
             between_epochs: called while F_phi and the inverse model are fitted; may raise to stop.
             networks: as in `learn_policy`.
         """
+        model, self.predictor = self._learn(callback, state, between_epochs, True)
+        assert self.predictor is not None
+        self._make_networks(model, between_epochs, networks)
+        return self.predictor
+
+    def _learn(
+        self,
+        callback: Callable[[StopWhenSolved], BaseCallback] | None,
+        state: dict[str, Any] | None,
+        between_epochs: Callable[[], None],
+        predicted: bool,
+    ) -> tuple[HerDDPG, GoalPredictor | None]:
+        """Train the object's policy, as long again where F_phi is off by more than `object_error`.
+
+        A policy can reach every goal by ways that are detours and change abruptly from one goal to
+        the next. F_phi's error tells; with twice the steps they straighten. The paths that tell are
+        counted as the policy's, so SLDR alone counts what it does with F_phi beside it.
+
+        Returns:
+            The algorithm, and F_phi where it is wanted or was made to judge by.
+        """
+        self.report(f"stage 1: the object of {self.env_id} learns to move by itself")
+        if sentence := what_is_followed(self.env_id):
+            self.report(f"  {sentence}")
+        made: GoalPredictor | None = None
+
+        def too_rough(model: HerDDPG, solved: StopWhenSolved) -> bool:
+            nonlocal made
+            made, path_steps = self._predict(model, solved, between_epochs)
+            self.policy_steps = self.steps
+            if float(np.mean(made.error_mm)) <= 1000.0 * self.settings["object_error"]:
+                return False
+            made = None
+            solved.notes = {**solved.notes, "paths": path_steps}
+            steps = 2 * model.num_timesteps
+            self.report(f"  its ways are too rough: the object learns on, for {steps} steps in all")
+            return True
+
+        judged = self.settings["object_error"] > 0.0
+        model, solved = self._train(callback, state, too_rough if judged else None)
+        if made is None and predicted:
+            made, _ = self._predict(model, solved, between_epochs)
+        elif made is None:
+            self._count(model, solved)
+        return model, made
+
+    def _count(self, model: HerDDPG, solved: StopWhenSolved) -> None:
+        """Note what the policy has cost, and what its last test came to."""
+        earlier = solved.notes.get("spent", 0) + solved.notes.get("paths", 0)
+        self.steps = self.policy_steps = earlier + model.num_timesteps
+        self.success = solved.rates[-1] if solved.rates else float("nan")
+
+    def _predict(
+        self, model: HerDDPG, solved: StopWhenSolved, between_epochs: Callable[[], None]
+    ) -> tuple[GoalPredictor, int]:
+        """Fit F_phi to noise-free paths; return it and the env steps that they took."""
         settings = self.settings
-        model, solved = self.learn_policy(callback, state, between_epochs, networks)
+        self._count(model, solved)
         env = self._env("paths")
         paths = collect_paths(model, env, settings["n_paths"])
         env.close()
@@ -155,7 +194,7 @@ class ObjectStage:
             + ("" if solved.solved else " (not solved: its imagined goals may mislead)")
         )
         self.report("stage 2: F_phi learns to imagine goals")
-        self.predictor = GoalPredictor.fit(
+        predictor = GoalPredictor.fit(
             paths.positions,
             paths.goals,
             env_id=self.env_id,
@@ -167,8 +206,25 @@ class ObjectStage:
             progress=lambda epoch, loss: between_epochs(),
             **{"device": str(model.device), **settings["predictor_fit"]},
         )
-        self.report(f"  held-out error {float(np.mean(self.predictor.error_mm)):.1f} mm")
-        return self.predictor
+        self.report(f"  held-out error {float(np.mean(predictor.error_mm)):.1f} mm")
+        return predictor, paths.env_steps
+
+    def _make_networks(
+        self, model: HerDDPG, between_epochs: Callable[[], None], asked: bool
+    ) -> None:
+        """Make what SLDR's reward reads, where it will be read."""
+        if not (asked or self.needs_networks):
+            return
+        self.networks = ObjectNetworks.learned(
+            model,
+            self.env_id,
+            physics_of_task(self.env_id),
+            seed=stream_seed(self.seed, "inverse"),
+            between_updates=between_epochs,
+            **self.settings["inverse_fit"],
+        )
+        error = self.networks.inverse_error
+        self.report(f"  {self.steps} env steps, inverse model's error {error:.3f}")
 
     def _choices(self) -> tuple[bool, ...]:
         """Whether the object stays on its surface, in the order of trial."""
@@ -178,17 +234,13 @@ class ObjectStage:
         self,
         callback: Callable[[StopWhenSolved], BaseCallback] | None,
         state: dict[str, Any] | None,
-    ) -> tuple[HerDDPG, StopWhenSolved, int]:
-        """Train the object's policy, off its surface once it does not learn on it.
-
-        Returns:
-            The algorithm, the callback that tests it, and the env steps of trials that were given
-            up.
-        """
+        too_rough: Callable[[HerDDPG, StopWhenSolved], bool] | None,
+    ) -> tuple[HerDDPG, StopWhenSolved]:
+        """Train the object's policy, off its surface once it does not learn on it."""
         settings, choices = self.settings, self._choices()
         if settings["object_timesteps"] <= SURFACE_STEPS:
             choices = choices[:1]  # too few to tell
-        notes = {"trial": 0, "spent": 0} if state is None else state.get("notes", {})
+        notes = {} if state is None else state.get("notes", {})
         spent: int = notes.get("spent", 0)
         for trial in range(notes.get("trial", 0), len(choices)):
             self.on_table = choices[trial]
@@ -199,7 +251,7 @@ class ObjectStage:
                 solved: StopWhenSolved, trial: int = trial, spent: int = spent
             ) -> BaseCallback:
                 if trial:
-                    solved.notes = {"trial": trial, "spent": spent}
+                    solved.notes = {**solved.notes, "trial": trial, "spent": spent}
                 return CallbackList([]) if callback is None else callback(solved)
 
             env, test_env = (self._env(name) for name in ("object", "object_test"))
@@ -214,6 +266,7 @@ class ObjectStage:
                 report=lambda steps, rate: self.report(f"  {steps:>7} steps: success {rate:.2f}"),
                 callback=noting,
                 state=state,
+                too_rough=too_rough,
                 **settings["object_algorithm"],
             )
             env.close()
@@ -222,7 +275,7 @@ class ObjectStage:
                 break
             spent, state = spent + model.num_timesteps, None
             self.report("  it does not learn on its surface: it may leave it from here on")
-        return model, solved, spent
+        return model, solved
 
     def _env(self, purpose: str) -> VecEnv:
         env = object_vec_env(

@@ -195,6 +195,13 @@ class StageSettings(Group):
     object_success: Annotated[
         Number, setting("success rate of two such tests in a row that ends its stage", ge=0, le=1)
     ] = 0.98
+    object_error: Annotated[
+        Number,
+        setting(
+            "mean error of F_phi, in metres, beyond which the object learns as long again; 0, none",
+            ge=0,
+        ),
+    ] = 0.0
     n_paths: Annotated[Whole, setting("object paths that F_phi is fitted on", ge=2, le=10**6)] = 512
     predictor_fit: Annotated[
         dict[str, Any] | None, setting("of F_phi", none="{}", group=PredictorSettings)

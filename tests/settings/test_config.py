@@ -97,7 +97,7 @@ def test_her_differs_from_fo_by_its_imagined_goals_alone() -> None:
 
 OBJECT_STAGE = (
     *("object_timesteps", "object_n_envs", "object_on_table", "object_algorithm"),
-    *("object_test_every", "object_test_episodes", "object_success"),
+    *("object_test_every", "object_test_episodes", "object_success", "object_error", "n_paths"),
 )
 # What each method's file says besides her.yml's settings (fo.yml's, where goals are imagined).
 OWN = {
