@@ -74,6 +74,11 @@ def test_frames_are_not_shown_faster_than_they_are_simulated(
 
     class Env:
         metadata = {"render_fps": 25}
+        window_closed = False
+
+        @property
+        def unwrapped(self) -> Env:
+            return self
 
     pace = demo._Pace()
     for took in (0.0, 0.01, 0.1, 0.0):
