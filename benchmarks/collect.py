@@ -224,13 +224,13 @@ def reaching_table(rows: list[Row]) -> str:
 def robots_table(rows: list[Row]) -> str:
     """Return the table of docs/robots.md, a line a run of an environment of others."""
     head = ("task", "method", "seed", "0.9 after env steps", "minutes", "in the end")
-    lines = [
-        (task, name_of(method), seeds([row]), *steps_and_minutes([row]), *end_and_cost([row]))
-        for (task, method), runs in groups(rows).items()
-        for row in runs
-        if task not in TASKS
-    ]
-    return table((*head, "at env steps", "and minutes"), lines)
+    lines = []
+    for row in rows:
+        if row["task"] not in TASKS:
+            who = (row["task"], name_of(row["method"]), seeds([row]))
+            figures = (*steps_and_minutes([row]), *end_and_cost([row]))
+            lines.append((*who, *figures, row["commit"][:7]))
+    return table((*head, "at env steps", "and minutes", "commit"), lines)
 
 
 PAGES: dict[Path, Callable[[list[Row]], str]] = {
