@@ -115,7 +115,8 @@ def _pnp_simple(groups: Sequence[Group], methods: Sequence[str]) -> Any:
 
 def _curves(groups: Sequence[Group], methods: Sequence[str], tasks: Sequence[str], x: str) -> Any:
     """Return learning curves, a panel a task; of six tasks they are the paper's last figure."""
-    figure, axes = _figure(-(-len(tasks) // 3), 3)
+    columns = min(3, len(tasks))
+    figure, axes = _figure(-(-len(tasks) // columns), columns)
     for axis, task in zip(axes, tasks, strict=False):
         _curve_panel(axis, groups, methods, task, x)
     for axis in axes[len(tasks) :]:
