@@ -89,6 +89,8 @@ def keep(run: Path) -> None:
     """Copy what plotting a run, and of some runs evaluating it, takes."""
     row = read_row(run)
     target = folder_of(row)
+    if run.resolve() == target.resolve():
+        return  # it is here already
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
     for name in KEPT:

@@ -89,13 +89,19 @@ def sample_efficiency(scores: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]
 
 
 def _middle_half(scores: np.ndarray) -> np.ndarray:
-    """Return interquartile means of scores (seeds, tasks, ...), one for each of what is left."""
+    """Return interquartile means of scores (seeds, tasks, ...), one for each of what is left.
+
+    rliable's own has one for all; called for each point of a curve it took minutes a figure.
+    """
     stats = need("scipy.stats", "plots")
     return np.asarray(stats.trim_mean(scores.reshape(-1, *scores.shape[2:]), 0.25, axis=0))
 
 
 def _share_of_better(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Return the share of pairs of runs (seeds, tasks) of a task that ours wins, ties half."""
+    """Return the share of pairs of runs (seeds, tasks) of a task that ours wins, ties half.
+
+    The figure of rliable's probability_of_improvement, which makes a rank test for each task.
+    """
     ours, theirs = ours[:, None], theirs[None]
     return float(np.mean((ours > theirs) + 0.5 * (ours == theirs)))
 

@@ -103,7 +103,6 @@ def test_methods_are_compared_on_tasks_that_all_have(tmp_path: Path) -> None:
 
 
 def test_table_compares_each_method_with_the_first(tmp_path: Path) -> None:
-    pytest.importorskip("rliable", reason="rliable is not installed")
     for seed, (fo, her) in enumerate([(0.9, 0.5), (0.8, 0.9)]):
         write_run(tmp_path, "PnPShelf", "fo", seed, fo)
         write_run(tmp_path, "PnPShelf", "her", seed, her)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rliable import metrics
 
 from sb3_follow_object.comparison.statistics import (
     interquartile_means,
@@ -11,8 +12,6 @@ from sb3_follow_object.comparison.statistics import (
     probabilities_of_improvement,
     sample_efficiency,
 )
-
-metrics = pytest.importorskip("rliable.metrics", reason="rliable is not installed")
 
 
 def test_interquartile_mean_leaves_the_outer_quarters_out() -> None:

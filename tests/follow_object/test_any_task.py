@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium.wrappers import TimeLimit
+from kept_states import keeping
 from small_models import weights
-from stable_baselines3.common.callbacks import BaseCallback
 from tiny_runs import SMALL_NET, TINY, config, quiet
 
 from sb3_follow_object.any_task import derived as looking
@@ -25,7 +24,6 @@ from sb3_follow_object.follow_object.saved_folder import read
 from sb3_follow_object.imagination.predictor_files import FACTS_FILE
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
 from sb3_follow_object.object_stage import stage as stages
-from sb3_follow_object.object_stage.policy import StopWhenSolved
 from sb3_follow_object.runs import predictor_cache
 from sb3_follow_object.settings.presets import run_config
 
@@ -98,22 +96,10 @@ def test_an_object_that_does_not_learn_on_its_surface_may_leave_it(
     monkeypatch.setattr(stages, "SURFACE_STEPS", 400)
     settings = {**TINY, "object_timesteps": 1200}
     states: list[dict[str, Any]] = []
-
-    class Keep(BaseCallback):
-        def __init__(self, solved: StopWhenSolved) -> None:
-            super().__init__()
-            self.solved = solved
-
-        def _on_step(self) -> bool:
-            return True
-
-        def _on_rollout_start(self) -> None:
-            states.append(copy.deepcopy(self.solved.state_dict()))
-
     said: list[str] = []
     run = FollowObject(ARM, report=said.append, **settings)
     stage = run.object_stage
-    predictor = stage.learn_predictor(Keep)
+    predictor = stage.learn_predictor(keeping(states))
     assert stage.on_table is False and predictor.object_on_table is False
     assert stage.policy_steps == 400 + 1200, "both trials are counted"
     assert sum("may leave it from here on" in sentence for sentence in said) == 1

@@ -2,34 +2,22 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback
+from kept_states import keeping
+from tiny_runs import TASK, TINY
 
 from sb3_follow_object.follow_object.follow_object import FollowObject
-from sb3_follow_object.object_stage.policy import StopWhenSolved
 from sb3_follow_object.object_stage.stage import ObjectStage
 
-ENV = "FollowObject/PushSideGap-v0"
-NET: dict[str, Any] = {
-    "batch_size": 32,
-    "buffer_size": 2000,
-    "gradient_steps": 1,
-    "policy_kwargs": {"net_arch": [16, 16]},
-}
 SETTINGS: dict[str, Any] = {
-    "n_threads": 1,
+    **TINY,
     "object_n_envs": 2,
-    "object_algorithm": NET,
     "object_test_every": 1,
     "object_test_episodes": 2,
     "object_success": 0.0,  # any two tests solve it
-    "n_paths": 8,
-    "predictor_fit": {"hidden": (16, 16), "epochs": 1},
-    "inverse_fit": {"hidden": (16, 16), "updates": 10},
 }
 # Env steps: two rollouts of two copies, a test of two episodes after each, and where it stops.
 SOLVED = 2 * (100 + 100) + 2
@@ -38,24 +26,8 @@ PATHS = 8 * 50
 
 def stage(error: float, said: list[str] | None = None, **settings: Any) -> ObjectStage:
     report = None if said is None else said.append
-    run = FollowObject(ENV, report=report, object_error=error, **{**SETTINGS, **settings})
+    run = FollowObject(TASK, report=report, object_error=error, **{**SETTINGS, **settings})
     return run.object_stage
-
-
-class Keep(BaseCallback):
-    """Keeps the states that a run could be resumed from."""
-
-    states: list[dict[str, Any]]
-
-    def __init__(self, solved: StopWhenSolved) -> None:
-        super().__init__()
-        self.solved = solved
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_start(self) -> None:
-        self.states.append(copy.deepcopy(self.solved.state_dict()))
 
 
 def test_smooth_paths_end_the_stage() -> None:
@@ -69,23 +41,22 @@ def test_smooth_paths_end_the_stage() -> None:
 
 def test_rough_paths_let_it_learn_as_long_again_and_it_resumes_exactly() -> None:
     said: list[str] = []
-    Keep.states = []
+    states: list[dict[str, Any]] = []
     whole = stage(1e-6, said)
-    predictor = whole.learn_predictor(Keep)
+    predictor = whole.learn_predictor(keeping(states))
     assert sum("the object learns on, for 804 steps in all" in sentence for sentence in said) == 1
     assert (whole.policy_steps, whole.steps) == (2 * SOLVED + PATHS, 2 * SOLVED + 2 * PATHS)
-    assert any("until" in state.get("notes", {}) for state in Keep.states)
-    for state in (Keep.states[0], Keep.states[-1]):
+    assert any("until" in state.get("notes", {}) for state in states)
+    for state in (states[0], states[-1]):
         again = stage(1e-6)
         resumed = again.learn_predictor(state=state)
         assert again.steps == whole.steps
         np.testing.assert_array_equal(resumed.error_mm, predictor.error_mm)
     # Stopped between the first part's end and the second's beginning.
-    Keep.states = []
-    stage(0.0).learn_policy(Keep)
-    ended = {**Keep.states[-1]}
-    again = stage(1e-6)
-    np.testing.assert_array_equal(again.learn_predictor(state=ended).error_mm, predictor.error_mm)
+    states = []
+    stage(0.0).learn_policy(keeping(states))
+    again = stage(1e-6).learn_predictor(state=states[-1])
+    np.testing.assert_array_equal(again.error_mm, predictor.error_mm)
 
 
 def test_unsolved_objects_do_not_learn_on() -> None:
