@@ -142,14 +142,24 @@ def steps_and_minutes(rows: list[Row]) -> tuple[str, str]:
     )
 
 
+def span(rates: list[float]) -> str:
+    """Return the lowest and the highest of some rates, in words."""
+    ends = sorted({f"{min(rates):.2f}", f"{max(rates):.2f}"})
+    return " to ".join(ends)
+
+
 def in_the_end(rows: list[Row]) -> str:
     """Return the final success of several seeds, in words."""
-    final = sorted(row["success_rate"] for row in rows if "success_rate" in row)
+    final = [row["success_rate"] for row in rows if "success_rate" in row]
     stopped = [row["validations"][-1] for row in rows if "success_rate" not in row]
-    said = [f"{median(final):.2f}"] if final else []
-    if len(final) > 1:
-        said = [f"{said[0]} ({final[0]:.2f} to {final[-1]:.2f})"]
-    said += [f"{v['success_rate']:.2f} of {v['episodes']:.0f}, stopped" for v in stopped]
+    said = []
+    if final:
+        spread = f" ({span(final)})" if len(final) > 1 else ""
+        said = [f"{median(final):.2f}{spread}"]
+    if stopped:
+        rates = span([v["success_rate"] for v in stopped])
+        how_many = f"{len(stopped)} " if len(rows) > 1 else ""
+        said += [f"{rates} of {stopped[0]['episodes']:.0f}, {how_many}stopped"]
     return "; ".join(said)
 
 
