@@ -119,7 +119,9 @@ def test_tables_say_what_was_stopped_or_not_run() -> None:
     line = next(line for line in collect.small_table(runs).splitlines() if "PnPShelf" in line)
     cells = line.strip("| ").split(" | ")
     assert cells[1:4] == ["3,000", "3", "0, 1, 2"], "a run that is not there counts as the last"
-    assert cells[4] == "0.94 (0.90 to 0.97); 0.40 of 76, stopped"
+    assert cells[4] == "0.94 (0.90 to 0.97); 0.40 of 76, 1 stopped"
+    assert collect.in_the_end(runs[2:]) == "0.40 of 76, stopped"
+    assert collect.in_the_end([row(0, 0.5), row(1, 0.7)]) == "0.50 to 0.70 of 76, 2 stopped"
     assert cells[5:] == ["not run", "not run"]
     assert "| not yet |" in collect.full_table(runs[2:])
 
