@@ -10,6 +10,7 @@ import argparse
 import inspect
 import runpy
 import sys
+import traceback
 from collections.abc import Sequence
 from typing import Any
 
@@ -228,6 +229,12 @@ def _sentence(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
+def _is_of_training(error: Exception) -> bool:
+    """Whether it was raised while an algorithm learned, so that what was asked for was sound."""
+    calls = traceback.walk_tb(error.__traceback__)
+    return any(frame.f_code.co_name == "learn" for frame, _ in calls)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command of rl_zoo3; return the exit status, 2 on bad input.
 
@@ -245,6 +252,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise ValueError(f"give {known} first, not {command!r}")
         _run(command, arguments)
     except (ValueError, OSError, RuntimeError, AssertionError, ImportError, EOFError) as error:
+        if isinstance(error, RuntimeError | AssertionError) and _is_of_training(error):
+            raise
         print(f"{PROGRAM}: {_sentence(error)}", file=sys.stderr)
         return USER_ERROR
     except TypeError as error:

@@ -165,6 +165,9 @@ class CurriculumCallback(CopyableCallback):
         if self._cycles >= self.every and not self.curriculum.finished:
             self._cycles = 0
             self._test()
+        # A rollout's end, and a test's, may lie beyond the last step; schedules end at 0.
+        model: Any = self.model
+        model._current_progress_remaining = max(0.0, model._current_progress_remaining)
         self.logger.record("curriculum/k_max", self.curriculum.k_max)
         self.logger.record("curriculum/test_steps", self.test_steps)
 
@@ -182,8 +185,6 @@ class CurriculumCallback(CopyableCallback):
         self.test_steps += episodes.env_steps
         model = self.model
         model.num_timesteps += episodes.env_steps  # tests cost steps like any others
-        # A rollout's end may lie beyond the last step; schedules end at 0.
-        model._current_progress_remaining = max(0.0, model._current_progress_remaining)
         self.logger.record("curriculum/test_success", episodes.success_rate)
         passed = self.curriculum.report(episodes.success_rate, len(episodes.success))
         self._share_curriculum()

@@ -89,7 +89,7 @@ class OriginalGoalEvalCallback(CopyableCallback):
         self.seed = None if seed is None else checked_whole("seed", seed, 0)
         self._resumed = False
         self._wall_before = checked_number("wall_before", wall_before)
-        self._started = time.monotonic()
+        self._started: float | None = None  # while it trains
 
     @property
     def env_steps(self) -> int:
@@ -117,7 +117,7 @@ class OriginalGoalEvalCallback(CopyableCallback):
         self.n_evaluations = int(state["n_evaluations"])
         self._resumed = True
         self._wall_before = float(state["wall_s"])
-        self._started = time.monotonic()
+        self._started = None
 
     def __getstate__(self) -> dict[str, Any]:
         if self.csv_path is not None:
@@ -129,14 +129,20 @@ class OriginalGoalEvalCallback(CopyableCallback):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._started = time.monotonic()  # another process may count from another moment
+        self._started = None  # another process may count from another moment
 
     @property
     def wall_s(self) -> float:
         """Seconds of training so far, those before an interruption included."""
-        return self._wall_before + time.monotonic() - self._started
+        return self._wall_before + (
+            0.0 if self._started is None else time.monotonic() - self._started
+        )
+
+    def _on_training_end(self) -> None:
+        self._wall_before, self._started = self.wall_s, None
 
     def _on_training_start(self) -> None:
+        self._wall_before, self._started = self.wall_s, time.monotonic()
         if self.n_evaluations and not self._resumed and self.model.num_timesteps == 0:
             self._last_steps = 0  # counted anew, as SB3 does its steps unless told otherwise
         if self.csv_path is not None:

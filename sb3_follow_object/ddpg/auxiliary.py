@@ -125,7 +125,7 @@ class AuxiliaryCritic(WholeModule):
             self.q_networks.parameters(), **{**policy.optimizer_kwargs, "lr": learning_rate}
         )
         self._sums: dict[str, th.Tensor] = {}
-        self._n_summed = 0
+        self._n_summed: dict[str, int] = {}
         self.to(policy.device)
 
     @property
@@ -179,13 +179,15 @@ class AuxiliaryCritic(WholeModule):
     def _log(self, **values: th.Tensor) -> None:
         for name, value in values.items():
             self._sums[name] = self._sums.get(name, 0.0) + value
-        self._n_summed += "reward" in values
+            self._n_summed[name] = self._n_summed.get(name, 0) + 1
 
     def take_log(self) -> dict[str, float]:
         """Return the means since the last call: reward, q_mean, critic_loss."""
-        n = max(1, self._n_summed)
-        means = {f"{self.reward.name}/{key}": v.item() / n for key, v in self._sums.items()}
-        self._sums, self._n_summed = {}, 0
+        means = {
+            f"{self.reward.name}/{key}": value.item() / self._n_summed[key]
+            for key, value in self._sums.items()
+        }
+        self._sums, self._n_summed = {}, {}
         return means
 
     def training_state(self) -> dict[str, Any]:

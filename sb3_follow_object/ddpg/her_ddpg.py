@@ -59,7 +59,7 @@ class HerDDPG(KeptDDPG):
     Args:
         env: with Dict observations "observation", "achieved_goal", "desired_goal", of which the
             first says where what is to be moved is: the networks read it and the desired goal.
-        gamma: in (0, 1); by default 1 - 1/T for episodes of T steps.
+        gamma: in [0, 1); by default 1 - 1/T for episodes of T steps.
         train_freq: in episodes of every environment, or in steps of every environment.
         noise_std: of the Gaussian noise on each action in [-1, 1]; `action_noise` replaces it.
         random_action_prob: in [0, 1].
@@ -216,6 +216,12 @@ class HerDDPG(KeptDDPG):
         if self.auxiliary is not None:
             self.auxiliary = resolve_auxiliary(self.auxiliary, self.env)
         super()._setup_model()
+        with_steps = isinstance(self.replay_buffer, FollowObjectReplayBuffer | None)
+        if self.hindsight_bound and not with_steps:
+            raise ValueError(
+                "hindsight_bound needs a FollowObjectReplayBuffer, which knows how soon an episode "
+                f"reached each goal; {type(self.replay_buffer).__name__} does not"
+            )
         self.rng = np.random.default_rng(np.random.randint(2**31))
         if not hasattr(self, "moments"):  # SB3's load() brings them before it comes here
             self.moments = InputMoments(self.actor.features_dim)
@@ -320,7 +326,7 @@ class HerDDPG(KeptDDPG):
         told: list[th.Tensor] = []
         for n in self._chunks(gradient_steps, batch_size):
             data, steps_to_goal = self._sample(n * batch_size, n)
-            if self._n_updates == 0 and self._device_replay is None:
+            if self._n_updates == 0:
                 check_rewards(data.rewards, self.target_clip == "auto", self.hindsight_bound)
             bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
             # All networks share their input moments, so features are computed once.

@@ -214,6 +214,8 @@ class Updates:
                 if isinstance(value, th.Tensor)
             ),
             tuple(parameter.data_ptr() for parameter in model.policy.parameters()),
+            (model.gamma, model.tau, model.action_l2, model.hindsight_bound),
+            model._target_bounds(),
             th.get_float32_matmul_precision(),
         )
 

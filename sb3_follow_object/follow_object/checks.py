@@ -20,6 +20,7 @@ from ..common.numbers import checked_whole
 from ..common.torch_helpers import usable_device
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs import IDS
+from ..object_stage.sldr import task_of_package
 from ..reach.approach import BEHIND, check_reachable, reach_first_settings
 from ..settings.fields import checked, settings_of
 from ..settings.learning import PredictorSettings
@@ -68,6 +69,7 @@ def check_algorithms(
     arguments = copy.deepcopy(settings["algorithm"])  # SB3 writes into policy_kwargs
     # What these two need is not there yet; their settings have been checked.
     if needs_networks:
+        task_of_package(env)
         del arguments["auxiliary"]
     if settings["imagine"] and arguments.get("replay_buffer_kwargs"):
         arguments["replay_buffer_kwargs"]["imagined_ratio"] = 0.0

@@ -8,14 +8,14 @@ from typing import Any, cast
 import numpy as np
 from gymnasium import spaces
 
-from ..envs.goal_envs import missing_goal_keys
+from ..envs.goal_envs import SUCCESS_METHODS, missing_goal_keys
 from ..envs.goal_space import GoalSpace, followed_space
 from .curriculum import Curriculum
 from .goal_predictor import GoalPredictor
 
 Observation = dict[str, np.ndarray]
 
-SUCCESS_METHODS = ("is_success", "_is_success")  # ours, and gymnasium-robotics'
+LAST = "last_observation"  # in an info that ends an episode: its last observation, as it was
 STREAM = 0x60A1  # parts the goals' random numbers from those of the environment's own seed
 
 

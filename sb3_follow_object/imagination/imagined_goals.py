@@ -77,18 +77,44 @@ def draw_goals(
     original, level = curriculum.draw(len(shown), rng)
     level[original] = 0
     rows = np.flatnonzero(~original)
-    if not rows.size:
-        return shown, level
+    if rows.size:
+        seen = None if contexts is None else contexts[rows]
+        shown[rows], level[rows] = imagine_afar(
+            predictor, curriculum, start[rows], goal[rows], level[rows], rng, seen
+        )
+    return shown, level
 
-    def seen(rows: np.ndarray) -> np.ndarray | None:
-        return None if contexts is None else contexts[rows]
 
-    shown[rows] = imagine(predictor, curriculum, start[rows], goal[rows], level[rows], seen(rows))
+def imagine_afar(
+    predictor: GoalPredictor,
+    curriculum: Curriculum,
+    start: np.ndarray,
+    goal: np.ndarray,
+    level: np.ndarray,
+    rng: np.random.Generator,
+    contexts: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the imagined goals of levels that were drawn, those too near to the start drawn again.
+
+    Args:
+        predictor: F_phi.
+        curriculum: says how near is too near, and which levels may be drawn.
+        start: object positions o_1, shape (n, 3), metres.
+        goal: original goals g, shape (n, 3), metres.
+        level: shape (n,) int, of `curriculum.drawable()`.
+        rng: source of randomness.
+        contexts: as in `imagine`.
+
+    Returns:
+        as `draw_goals`.
+    """
+    shown, level = imagine(predictor, curriculum, start, goal, level, contexts), level.copy()
     distance = predictor.space.distance
-    near = rows[distance(shown[rows], start[rows]) < curriculum.min_distance]
+    near = np.flatnonzero(distance(shown, start) < curriculum.min_distance)
     if near.size:
         choices = curriculum.drawable()
-        every = _all_levels(predictor, curriculum, start[near], goal[near], seen(near))
+        seen = None if contexts is None else contexts[near]
+        every = _all_levels(predictor, curriculum, start[near], goal[near], seen)
         ways = every[:, choices - 1]
         far = distance(ways, start[near, None]) >= curriculum.min_distance
         for row, way, mask in zip(near, ways, far, strict=True):

@@ -21,6 +21,7 @@ from ..common.vec_env_copies import CopyableVecEnvWrapper, let_vec_envs_be_copie
 from ..envs.robot_copies import ProcessVecEnv
 from .curriculum import Curriculum
 from .goal_env import (
+    LAST,
     STREAM,
     Observation,
     check_goal_stays,
@@ -137,7 +138,8 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
         ]
         for i in ended:
             last = infos[i]["terminal_observation"]
-            infos[i]["terminal_observation"] = {**last, "desired_goal": self._shown[i].copy()}
+            last = {**last, "desired_goal": self._shown[i].copy()}
+            infos[i] |= {"terminal_observation": last, LAST: last}
         if ended.size:
             self._draw(ended, obs)
         return self._relabel(obs), rewards, dones, infos

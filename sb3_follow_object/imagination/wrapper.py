@@ -14,13 +14,13 @@ import gymnasium as gym
 import numpy as np
 
 from ..any_task.context import read_context
-from ..any_task.tasks import steps_of_object
+from ..any_task.tasks import physics_of_task, steps_of_object
 from ..common.answers import check_shape, one_number
 from ..common.copies import WholeCopies
 from ..common.providers import provider
-from ..envs import IDS, physics_id
 from .curriculum import Curriculum
 from .goal_env import (
+    LAST,
     STREAM,
     Observation,
     check_goal_stays,
@@ -133,7 +133,10 @@ class ImaginedGoalWrapper(
             "is_success": self._succeeds(achieved, self._shown),
             "original_success": self._succeeds(achieved, self._original),
         }
-        return self._relabel(obs), paid, terminated, truncated, info
+        obs = self._relabel(obs)
+        if terminated or truncated:
+            info[LAST] = obs
+        return obs, paid, terminated, truncated, info
 
     def load_curriculum(self, state: dict[str, Any]) -> None:
         """Follow a curriculum that advances elsewhere (``Curriculum.state_dict``), from now on."""
@@ -185,8 +188,7 @@ def _find_predictor(source: str | os.PathLike[str], env: gym.Env) -> GoalPredict
     if source == AUTO:
         found: GoalPredictor = provider("predictor", AUTO)(env.spec.id)
         return found
-    physics = physics_id(env.spec.id) if env.spec.id in IDS else None
-    return GoalPredictor.load(source, env_id=env.spec.id, physics=physics)
+    return GoalPredictor.load(source, env_id=env.spec.id, physics=physics_of_task(env.spec.id))
 
 
 def _curriculum(env: gym.Env, settings: Mapping[str, Any] | None) -> Curriculum:

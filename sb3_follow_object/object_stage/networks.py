@@ -193,7 +193,7 @@ class ObjectNetworks(WholeModule):
         self.inverse_error = float(th.stack(losses[-100:]).mean())
 
     def features(self, states: th.Tensor, goals: th.Tensor) -> th.Tensor:
-        """Standardise states (n, 12) and goals (n, 3) as the object stage did."""
+        """Standardise states (n, n_observed) and goals (n, 3) as the object stage did."""
         return self.extractor({"observation": states, "desired_goal": goals})
 
     def act(self, states: th.Tensor, goals: th.Tensor) -> th.Tensor:
@@ -206,7 +206,7 @@ class ObjectNetworks(WholeModule):
         return lowest([critic(inputs) for critic in self.critics])
 
     def infer(self, states: th.Tensor, next_states: th.Tensor, goals: th.Tensor) -> th.Tensor:
-        """Return the actions (n, 7) that would have led from states to next states (n, 12)."""
+        """Return the actions (n, 7) that would have led from states to next states."""
         after = self.features(next_states, goals)[:, : self.n_observed]
         return self.inverse(th.cat([self.features(states, goals), after], dim=1))
 

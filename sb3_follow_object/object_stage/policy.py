@@ -43,7 +43,8 @@ class StopWhenSolved(CopyableCallback):
     Args:
         test_env: fresh copies of the training environment.
         n_episodes: episodes a test.
-        every_episodes: training episodes of each copy between two tests.
+        every_episodes: rollouts between two tests, of an episode of each copy unless
+            `train_freq` says otherwise.
         success_rate: in [0, 1]; two tests in a row must reach it, so that luck does not stop early.
         report: called with (env_steps, success rate) after each test.
     """

@@ -54,7 +54,7 @@ class SldrReward(AuxiliaryReward):
         networks = options.get("object_networks", AUTO)
         if env is None:
             return options  # a saved algorithm brings them
-        env_id = _task(env)
+        env_id = task_of_package(env)
         if isinstance(networks, ObjectNetworks):
             networks.check(env_id, physics_id(env_id), "the object_networks given")
         elif networks == AUTO:
@@ -91,8 +91,12 @@ def reads_object_networks(algorithm: Mapping[str, Any]) -> bool:
     return True
 
 
-def _task(env: VecEnv) -> str:
-    """Return the id of the robot task that an environment is."""
+def task_of_package(env: VecEnv) -> str:
+    """Return the id of the robot task that an environment is.
+
+    Raises:
+        ValueError: it is none of this package, whose observations alone hold the object's state.
+    """
     spec = env.get_attr("spec", indices=[0])[0]
     env_id = "" if spec is None else str(spec.id)
     if env_id not in IDS or IDS[env_id][1]:

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import (
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from ..common.vec_env_copies import CopyableVecEnvWrapper
+from ..imagination.goal_env import LAST
 from ..imagination.vec_env import ImaginedGoalVecEnv
 from ..replay.episode_buffer import EXECUTED
 from ..settings.stages import ReachFirstSettings
@@ -110,6 +111,8 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
         ]
         self._obs = obs
         ended = np.flatnonzero(dones)
+        for i in ended:
+            infos[i][LAST] = infos[i]["terminal_observation"]
         if ended.size:
             self.approach.begin(ended, obs, self._ahead(ended))
         return obs, rewards, dones, infos

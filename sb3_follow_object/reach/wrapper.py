@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..common.copies import WholeCopies
+from ..imagination.goal_env import LAST
 from ..replay.episode_buffer import EXECUTED
 from ..settings.stages import ReachFirstSettings
 from .actor import ReachActor
@@ -83,8 +84,10 @@ class ReachFirstWrapper(
         executed = self.approach.act(self._obs, np.asarray(action)[None])[0]
         obs, reward, terminated, truncated, info = self.env.step(executed)
         self._obs = _batch_of_one(obs)
-        self.approach.arrive(self._obs, np.array([terminated or truncated]))
-        return obs, float(reward), terminated, truncated, {**info, EXECUTED: executed}
+        ended = terminated or truncated
+        self.approach.arrive(self._obs, np.array([ended]))
+        info = {**info, EXECUTED: executed, **({LAST: obs} if ended else {})}
+        return obs, float(reward), terminated, truncated, info
 
 
 def _batch_of_one(obs: Observation) -> Observation:

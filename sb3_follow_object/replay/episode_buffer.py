@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from ..envs.goal_envs import episode_steps
 from ..envs.goal_space import GoalSpace, goal_space
+from ..imagination.goal_env import LAST
 from ..settings.sizes import check_buffer
 from .episode_table import EpisodeTable
 from .record_buffer import Gathered, RecordReplayBuffer
@@ -61,6 +63,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         """
         if self.n_added == 0:
             self.check_size()
+        next_obs = self._with_last_observations(next_obs, done, infos)
         if EXECUTED in infos[0]:
             action = self._scaled(np.stack([info[EXECUTED] for info in infos]))
         pos = self.pos
@@ -87,6 +90,30 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         self.full |= self.pos == 0
         self.n_added += 1
         self._end_finished(np.asarray(done, dtype=bool).reshape(self.n_envs), infos)
+
+    def _with_last_observations(
+        self, next_obs: dict[str, np.ndarray], done: np.ndarray, infos: list[dict[str, Any]]
+    ) -> dict[str, np.ndarray]:
+        """Return next observations in which nothing is clipped.
+
+        VecNormalize keeps raw observations, but of an episode's last one only what it has scaled
+        and clipped, and SB3 cannot undo the clipping: a first lift would be a lift of millimetres.
+        """
+        normalizer = unwrap_vec_normalize(self.env) if self.env is not None else None
+        if normalizer is None:
+            return next_obs
+        for env_idx in np.flatnonzero(done):
+            last = infos[env_idx].get(LAST)
+            seen = infos[env_idx].get("terminal_observation")
+            if last is None or seen is None:
+                continue
+            scaled = normalizer.normalize_obs(last)
+            # Where another wrapper has changed it since, it is not what the policy saw.
+            if all(np.array_equal(scaled[key], seen[key]) for key in scaled):
+                next_obs = {key: np.array(value) for key, value in next_obs.items()}
+                for key, value in last.items():
+                    next_obs[key][env_idx] = value
+        return next_obs
 
     def _scaled(self, actions: np.ndarray) -> np.ndarray:
         """Scale an environment's actions (n_envs, action_dim) to [-1, 1], as they are stored."""

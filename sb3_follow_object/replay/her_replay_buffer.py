@@ -14,7 +14,7 @@ from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
 from ..common.answers import one_each
 from ..common.numbers import checked_whole
-from ..imagination.imagined_goals import imagine
+from ..imagination.imagined_goals import imagine_afar
 from ..imagination.vec_env import imagination_of
 from ..settings.learning import ReplaySettings
 from .cher import GoalSelection
@@ -173,7 +173,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         if self.env is not None and env is not self.env:
             self.end_episodes()
         self.env = env
-        if self.n_added == 0:
+        if self.size() == 0:
             self._make_room_for_contexts(env)
 
     def _make_room_for_contexts(self, env: VecEnv) -> None:
@@ -188,7 +188,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         check_copies(self.n_envs, env.num_envs)
         if self.imagined_ratio > 0.0:
             n, stored = len(imagination_of(env, IMAGINED_RATIO)[0].context), self.contexts.shape[-1]
-            if self.n_added and n != stored:
+            if self.size() and n != stored:
                 raise ValueError(
                     f"the environment's predictor sees {n} numbers of other things' places, but the"
                     f" replay buffer holds {stored} of each step; give the model a new buffer"
@@ -233,6 +233,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             for name, store in stores.items()
         ):
             raise ValueError("the saved replay buffer has another shape than this one")
+        self.ep_length[:] = 0  # of episodes that are there now
         for name, store in stores.items():
             store[: len(slots[name])] = slots[name]
         self.pos, self.full = state["pos"], state["full"]
@@ -377,14 +378,15 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         return self._achieved_goals(flat), steps, far
 
     def _imagined_goals(self, episode: np.ndarray) -> np.ndarray:
-        """F_phi(o_1, g, k) of each episode at a level drawn from 1..k_max (n, d)."""
+        """F_phi(o_1, g, k) of each episode at a level that it could have shown, (n, d)."""
         predictor, curriculum = imagination_of(self.env, IMAGINED_RATIO)
         first = episode[:, 0], episode[:, 1]
         start = self.observations["achieved_goal"][first]
         goal = self.original_goals[first]
-        level = self.rng.integers(1, curriculum.k_max, size=len(episode), endpoint=True)
+        lowest, *_ = curriculum.drawable()
+        level = self.rng.integers(lowest, curriculum.k_max, size=len(episode), endpoint=True)
         contexts = self.contexts[first] if self.contexts.size else None
-        return imagine(predictor, curriculum, start, goal, level, contexts)
+        return imagine_afar(predictor, curriculum, start, goal, level, self.rng, contexts)[0]
 
     def _reward(self, achieved: np.ndarray, desired: np.ndarray, flat: np.ndarray) -> np.ndarray:
         """Rewards (n,) of goals achieved for goals desired (n, d) in the transitions `flat`."""

@@ -309,5 +309,7 @@ def test_schedules_end_at_zero_with_tests_beyond_the_last_step(algorithm: Any) -
     model.learn(3 * rollout + 1, callback=CurriculumCallback(imagining(curriculum, "test"), N))
     assert model.num_timesteps == 4 * rollout
     assert min(rates) >= 0.0 and rates[-1] <= 1e-3 / 3
-    model.learn(rollout // 2, callback=CurriculumCallback(imagining(curriculum, "test"), N))
-    assert min(rates) == 0.0
+    for every in (1, 100):  # with a test after it, and with none
+        callback = CurriculumCallback(imagining(curriculum, "test"), N, every=every)
+        model.learn(rollout // 2, callback=callback)
+        assert min(rates) == 0.0

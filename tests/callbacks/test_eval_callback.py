@@ -12,8 +12,10 @@ import pytest
 import toy
 from imagined import N, bare, imagining, learner
 from stable_baselines3 import DDPG
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_follow_object.callbacks import eval_callback
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
 from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
 
@@ -96,6 +98,25 @@ def test_a_resumed_evaluation_goes_on_with_its_file(tmp_path: Path) -> None:
     assert found[:2] == kept
     assert [row["train_steps"] for row in found] == ["80", "160", "240"]
     assert float(found[2]["wall_s"]) >= float(kept[1]["wall_s"])
+
+
+def test_only_training_counts_as_training_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(eval_callback.time, "monotonic", lambda: now[0])
+    evaluation = OriginalGoalEvalCallback(bare(), N, 80, wall_before=5.0)
+    now[0] += 1000.0  # the object learns meanwhile
+    model = learner(bare())
+
+    class TakesTwoSeconds(BaseCallback):
+        def _on_step(self) -> bool:
+            now[0] += 2.0 / 20  # of twenty steps
+            return True
+
+    for ends_at in (7.0, 9.0):
+        model.learn(80, callback=[evaluation, TakesTwoSeconds()], reset_num_timesteps=False)
+        assert evaluation.wall_s == pytest.approx(ends_at)
+        now[0] += 1000.0  # a pause
+        assert evaluation.wall_s == pytest.approx(ends_at)
 
 
 def test_another_runs_file_is_left_alone(tmp_path: Path) -> None:

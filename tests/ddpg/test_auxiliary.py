@@ -151,3 +151,14 @@ def test_normalised_environments_are_refused() -> None:
     env = VecNormalize(DummyVecEnv([PointEnv]))
     with pytest.raises(ValueError, match="leave VecNormalize"):
         HerDDPG("MultiInputPolicy", env, auxiliary=UP, **TINY)
+
+
+def test_means_are_of_the_updates_that_had_a_value() -> None:
+    critic = make_model(auxiliary=UP, policy_delay=4).auxiliary_critic
+    assert critic is not None
+    for number in range(1, 9):
+        critic._log(reward=th.tensor(float(number)))
+        if number % 4 == 0:  # when the actor's turn comes
+            critic._log(q_mean=th.tensor(-2.0))
+    assert critic.take_log() == {"up/reward": 4.5, "up/q_mean": -2.0}
+    assert critic.take_log() == {}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from small_models import TINY, make_model, success_rate
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from toy import HORIZON, PointEnv
 
@@ -340,6 +341,11 @@ def test_rewards_above_the_bounds_of_targets_are_refused() -> None:
     with pytest.raises(ValueError, match="a reward is 1; target_clip 'auto' is for none above 0"):
         HerDDPG("MultiInputPolicy", env, **TINY).learn(100)
     HerDDPG("MultiInputPolicy", env, **TINY, target_clip=(0.0, 10.0)).learn(100)
+
+
+def test_a_bound_that_the_replay_buffer_cannot_give_is_refused() -> None:
+    with pytest.raises(ValueError, match="hindsight_bound needs a FollowObjectReplayBuffer"):
+        make_model(replay_buffer_class=HerReplayBuffer, hindsight_bound=True)
 
 
 def test_other_optimisers_and_observations_of_more_dimensions() -> None:

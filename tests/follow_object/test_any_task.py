@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from small_models import weights
 from tiny_runs import SMALL_NET, TINY, config, quiet
 
 from sb3_follow_object.any_task import derived as looking
-from sb3_follow_object.any_task.tasks import kept_as
+from sb3_follow_object.any_task.tasks import kept_as, physics_of_task
 from sb3_follow_object.common.cache import CACHE_VARIABLE
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.follow_object.saved_folder import read
@@ -109,6 +110,38 @@ def test_an_object_that_does_not_learn_on_its_surface_may_leave_it(
         resumed = again.learn_predictor(state=state)
         assert again.policy_steps == stage.policy_steps
         np.testing.assert_array_equal(resumed.error_mm, predictor.error_mm)
+
+
+def test_an_object_that_learned_on_is_kept_whatever_its_last_tests_say(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def learned_on(*args: Any, **kwargs: Any) -> Any:
+        model, solved = train(*args, **kwargs)
+        solved.rates, solved.notes = [1.0, 1.0, 0.5], {"until": model.num_timesteps}
+        return model, solved
+
+    train = stages.train_object_policy
+    monkeypatch.setattr(stages, "train_object_policy", learned_on)
+    monkeypatch.setattr(stages, "SURFACE_STEPS", 400)
+    stage = FollowObject(ARM, report=quiet, **{**TINY, "object_timesteps": 1200}).object_stage
+    stage.learn_policy()
+    assert stage.on_table is True and stage.policy_steps == 400
+
+
+def test_sldr_is_refused_before_the_object_learns() -> None:
+    run = FollowObject(ARM, **{**TINY, "algorithm": {**SMALL_NET, "auxiliary": {"name": "sldr"}}})
+    with pytest.raises(ValueError, match="needs a robot task of this package"):
+        run.check()
+
+
+def test_a_folders_predictor_must_be_of_the_tasks_physics(tmp_path: Path) -> None:
+    FollowObject(ARM, report=quiet, **TINY).object_stage.learn_predictor().save(tmp_path / "phi")
+    env = ImaginedGoalWrapper(gym.make(ARM), tmp_path / "phi", {"p": 0.0})
+    assert env.predictor.physics == physics_of_task(ARM)
+    facts = json.loads((tmp_path / "phi" / FACTS_FILE).read_text())
+    (tmp_path / "phi" / FACTS_FILE).write_text(json.dumps({**facts, "physics": "another"}))
+    with pytest.raises(ValueError, match="physics"):
+        _ = ImaginedGoalWrapper(gym.make(ARM), tmp_path / "phi", {"p": 0.0}).predictor
 
 
 def test_a_wall_that_stands_elsewhere_in_each_episode_is_seen_in_all_stages(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import sys
 import zipfile
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -266,6 +267,17 @@ def test_what_cannot_be_meant_is_one_line(
 ) -> None:
     zoo_exits(2, *TRAIN, *arguments)
     assert sentence in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_fault_of_the_training_keeps_its_traceback(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def out_of_memory(self: Any, *args: Any, **kwargs: Any) -> None:
+        raise RuntimeError("CUDA out of memory")
+
+    monkeypatch.setattr(zoo.ZooHerDDPG, "train", out_of_memory)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        zoo_exits(2, *TRAIN)
 
 
 def test_trials_that_are_never_evaluated_are_pruned_with_the_reason(

@@ -252,3 +252,11 @@ def test_a_goal_that_moves_sends_replay_back_to_the_host() -> None:
     with pytest.warns(UserWarning, match="goes on on the host: .* goals that stay the same"):
         model.learn(40)
     assert model._device_replay is None and model._n_updates > 0
+
+
+def test_rewards_are_checked_there_as_well() -> None:
+    env = DummyVecEnv([DensePointEnv] * 4)
+    with pytest.raises(ValueError, match="hindsight_bound is for rewards of -1 and 0"):
+        HerDDPG("MultiInputPolicy", env, **TINY, hindsight_bound=True, replay_on_device=True).learn(
+            100
+        )

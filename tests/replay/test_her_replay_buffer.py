@@ -150,6 +150,32 @@ def test_imagined_ratio_relabels_with_imagined_goals() -> None:
     assert error.max() < 1e-5
 
 
+def test_imagined_ratio_shows_no_level_that_training_would_not() -> None:
+    for options, nearest in ({"min_distance": 0.12}, 0.15), ({"sampling": "max"}, 0.2):
+        env = ImaginedGoalVecEnv(
+            make_env(), StraightPredictor(), Curriculum(HORIZON, k_max=4, p=0.5, **options)
+        )
+        env.seed(0)
+        buffer = make_buffer(env, imagined_ratio=1.0, n_sampled_goal=10**9)
+        fill([buffer], env, HORIZON)
+        starts = np.repeat(buffer.observations["achieved_goal"][:1], 500, axis=0).reshape(-1, 3)
+        episode = np.tile(buffer.table.facts[:2], (500, 1))
+        far = np.linalg.norm(buffer._imagined_goals(episode) - starts[episode[:, 1]], axis=1)
+        assert far.min() > nearest - 1e-5 and far.max() < 0.2 + 1e-5
+
+
+def test_a_state_may_take_the_place_of_more_than_it_holds() -> None:
+    env = make_env()
+    buffer, fuller = make_buffer(env, size=100), make_buffer(env, size=100)
+    fill([buffer], env, 33)
+    fill([fuller], env, 95)
+    fuller.load_state_dict(buffer.state_dict())
+    fill([buffer, fuller], env, 90, seed=1)
+    expected, got = as_arrays(buffer.sample(500)), as_arrays(fuller.sample(500))
+    for key in expected:
+        np.testing.assert_array_equal(got[key], expected[key])
+
+
 def test_imagined_ratio_needs_the_wrapper() -> None:
     with pytest.raises(ValueError, match="ImaginedGoalVecEnv"):
         make_buffer(make_env(), imagined_ratio=0.1)

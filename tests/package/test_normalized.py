@@ -1,0 +1,89 @@
+"""Around stock algorithms in VecNormalize: what is stored is what happened, to the last bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from imagined import imagining
+from stable_baselines3 import DDPG
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from toy import HORIZON, PointEnv, StraightPredictor, curriculum
+
+from sb3_follow_object import (
+    FollowObjectReplayBuffer,
+    ImaginedGoalWrapper,
+    ReachFirstVecEnv,
+    ReachFirstWrapper,
+)
+
+SETTINGS: dict[str, Any] = {"effector": (0, 1, 2), "height": 0.0}
+
+
+class Leaping(PointEnv):
+    """Its point stands still until the last step takes it far away."""
+
+    def step(self, action: np.ndarray) -> Any:
+        leap = np.array([0.0, 0.0, 2.0]) if self.steps == HORIZON - 1 else 0.0
+        self.position = self.position + leap
+        return super().step(0.0 * action)
+
+
+def imagining_each() -> VecEnv:
+    return DummyVecEnv(
+        [lambda: ImaginedGoalWrapper(Leaping(), StraightPredictor(), curriculum())] * 2
+    )
+
+
+def reaching_each() -> VecEnv:
+    return DummyVecEnv([lambda: ReachFirstWrapper(Leaping(), **SETTINGS)] * 2)
+
+
+FACES: dict[str, Callable[[], VecEnv]] = {
+    "ImaginedGoalVecEnv": lambda: imagining(curriculum(), n=2, env=Leaping),
+    "ImaginedGoalWrapper": imagining_each,
+    "ReachFirstVecEnv": lambda: ReachFirstVecEnv(DummyVecEnv([Leaping] * 2), **SETTINGS),
+    "ReachFirstWrapper": reaching_each,
+}
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_an_episodes_last_observation_is_not_clipped(face: str) -> None:
+    model = DDPG(
+        "MultiInputPolicy",
+        VecNormalize(FACES[face](), norm_reward=False, clip_obs=5.0),
+        replay_buffer_class=FollowObjectReplayBuffer,
+        learning_starts=10**9,
+        train_freq=HORIZON,
+        buffer_size=1000,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+    )
+    model.learn(10 * HORIZON)
+    buffer: Any = model.replay_buffer
+    first, last = (slice(at, buffer.pos, HORIZON) for at in (0, HORIZON - 1))
+    for key in ("observation", "achieved_goal"):
+        leaps = buffer.next_observations[key][last] - buffer.observations[key][first]
+        np.testing.assert_allclose(leaps[..., 2], 2.0, atol=1e-6)
+    assert buffer.goals_are_shared, "goals are the same before and after a step"
+
+
+def test_what_another_wrapper_has_changed_is_not_taken_back() -> None:
+    class Shifted(VecNormalize):
+        def step_wait(self) -> Any:
+            obs, rewards, dones, infos = super().step_wait()
+            for i in np.flatnonzero(dones):
+                infos[i]["terminal_observation"]["observation"] += 1.0
+            return obs, rewards, dones, infos
+
+    env = Shifted(FACES["ImaginedGoalVecEnv"](), norm_reward=False)
+    buffer = FollowObjectReplayBuffer(
+        100, env.observation_space, env.action_space, env, n_envs=2, seed=0
+    )
+    env.reset()
+    for _ in range(HORIZON):
+        obs, _, dones, infos = env.step(np.zeros((2, 3), np.float32))
+    assert dones.all() and isinstance(obs, dict)
+    assert buffer._with_last_observations(obs, dones, infos) is obs
