@@ -13,6 +13,10 @@ from .robotics import check_robotics
 from .task_table import IDS
 
 SUCCESS_METHODS = ("is_success", "_is_success")  # ours, and gymnasium-robotics'
+SAY_GOALS = (
+    "say with goal= and is_success= what is achieved, what is desired and when that is reached"
+)
+SAY_LENGTH = "register it with max_episode_steps, or wrap it in gymnasium.wrappers.TimeLimit"
 _GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
@@ -37,9 +41,12 @@ def check_task(env_id: str) -> str:
     try:
         missing = missing_goal_keys(env.observation_space)
         if missing:
-            raise ValueError(f"{env_id!r} has no goals: its observations lack {', '.join(missing)}")
+            lacking = ", ".join(missing)
+            raise ValueError(
+                f"{env_id!r} has no goals: its observations lack {lacking}; {SAY_GOALS} (RobotTask)"
+            )
         if env.spec is None or env.spec.max_episode_steps is None:
-            raise ValueError(f"{env_id!r} does not say how long its episodes are")
+            raise ValueError(f"{env_id!r} does not say how long its episodes are; {SAY_LENGTH}")
         if _hides_success(env) and not _judges(env):
             raise ValueError(f"{env_id!r} does not tell in its info whether the goal is reached")
     finally:

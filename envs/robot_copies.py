@@ -62,18 +62,48 @@ def robot_vec_env(env_id: str, n_envs: int, n_threads: int | None = None, **opti
 def robot_maker(env_id: str, **options: Any) -> Callable[[], gym.Env]:
     """Return what makes one copy of a registered task, with what it lacks of `RobotTask`."""
     spec = gym.spec(import_task(env_id))
-    try:
-        probe = gym.make(spec, **options)
+    return partial(_make, spec, _lacks_face(spec, options), options)
+
+
+def with_face(env: gym.Env) -> gym.Env:
+    """Return an environment with what it lacks of `RobotTask`.
+
+    Another of its kind is made and stepped to see that; one that gymnasium did not make is left
+    alone.
+
+    Raises:
+        ValueError: no other can be made.
+    """
+    spec = env.spec
+    if spec is None or spec.id in IDS or spec.id not in gym.registry or not may_be_faced(env):
+        return env
+    return _faced(env) if _lacks_face(spec, {}) else env
+
+
+def _lacks_face(spec: EnvSpec, options: dict[str, Any]) -> bool:
+    """Whether an environment with goals lacks what `RobotTask` adds, looked at once a process."""
+    key = (spec.id, spec.entry_point, repr(sorted({**spec.kwargs, **options}.items(), key=str)))
+    if key not in _LACKING:
         try:
-            wrapped = may_be_faced(probe) and needs_face(probe)
-        finally:
-            probe.close()
-    except ValueError:
-        raise
-    except Exception as error:  # an environment of somebody's may raise anything
-        said = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{env_id!r} cannot be made and begun: {said}") from error
-    return partial(_make, spec, wrapped, options)
+            probe = gym.make(spec, **options)
+            try:
+                _LACKING[key] = may_be_faced(probe) and needs_face(probe)
+            finally:
+                probe.close()
+        except ValueError:
+            raise
+        except Exception as error:  # an environment of somebody's may raise anything
+            said = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{spec.id!r} cannot be made and begun: {said}") from error
+    return _LACKING[key]
+
+
+_LACKING: dict[Any, bool] = {}
+
+
+def _faced(env: gym.Env) -> gym.Env:
+    known = env.has_wrapper_attr("followed_object")
+    return RobotTask(env, object=env.get_wrapper_attr("followed_object") if known else None)
 
 
 def may_be_faced(env: gym.Env) -> bool:
@@ -87,10 +117,7 @@ def _make(spec: EnvSpec, wrapped: bool, options: dict[str, Any]) -> gym.Env:
     if is_of_robotics(spec):
         import_robotics()  # quietly, before gymnasium does so in a process that has not
     env = gym.make(spec, **options)
-    if not wrapped:
-        return env
-    known = env.has_wrapper_attr("followed_object")
-    return RobotTask(env, object=env.get_wrapper_attr("followed_object") if known else None)
+    return _faced(env) if wrapped else env
 
 
 class ProcessVecEnv(VecEnv):

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..common.answers import one_each, one_number
-from .goal_envs import SUCCESS_METHODS, missing_goal_keys
+from .goal_envs import SAY_GOALS, SUCCESS_METHODS, missing_goal_keys
 from .goal_space import POSITIONS
 
 Judge = Callable[..., Any]
@@ -67,9 +67,9 @@ class RobotTask(gym.Wrapper):
         if goal is not None:
             self.observation_space = _goal_space(env.observation_space)
         elif missing:
+            lacking = ", ".join(missing)
             raise ValueError(
-                f"{_name(env)} has no goals: its observations lack {', '.join(missing)}; say with "
-                "goal= and is_success= what is achieved, what is desired and when that is reached"
+                f"{_name(env)} has no goals: its observations lack {lacking}; {SAY_GOALS}"
             )
         if effector is not None:
             n = spaces.flatdim(cast(spaces.Dict, self.observation_space)["observation"])
@@ -195,7 +195,7 @@ def rewards_on_and_off(env: gym.Env, desired: np.ndarray) -> tuple[float, float]
     reward = env.get_wrapper_attr("compute_reward")
     pays = (reward(achieved, desired, {}) for achieved in (desired, desired + _FAR))
     on, off = (one_number(each, "compute_reward") for each in pays)
-    return on, off
+    return on + 0.0, off + 0.0  # no minus before a zero
 
 
 def _success_method(env: gym.Env) -> Judge | None:

@@ -13,7 +13,7 @@ from ..common.cache import SET_THE_VARIABLE, cache_folder
 from ..common.files import lock
 from ..common.numbers import checked_whole
 from ..common.reports import Report
-from ..envs.goal_envs import missing_goal_keys
+from ..envs.goal_envs import SAY_GOALS, SAY_LENGTH, missing_goal_keys
 from ..envs.goal_space import followed_space
 from ..envs.physics_engine import mujoco
 from ..envs.registration import import_task
@@ -22,7 +22,7 @@ from ..envs.robot_face import RobotTask, rewards_on_and_off
 from ..envs.robot_parts import body_name
 from .context import context_of
 from .finding import Candidate, Effector, Observed, candidates, find_effector, find_object, observe
-from .physics_access import physics_of
+from .physics_access import is_simulated, physics_of
 from .resets import Resets, record_resets, varying_bodies
 from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of
 
@@ -122,9 +122,10 @@ def _look(env_id: str, report: Report) -> Derived:
 def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
     missing = missing_goal_keys(env.observation_space)
     if missing:
+        if not is_simulated(env):
+            raise ValueError("it has neither goals nor a MuJoCo simulation: there is no object")
         raise ValueError(
-            f"there are no goals: its observations lack {', '.join(missing)}; say with goal= and "
-            "is_success= what is achieved, what is desired and when that is reached"
+            f"there are no goals: its observations lack {', '.join(missing)}; {SAY_GOALS}"
         )
     horizon = _horizon(env)
     followed_space(env.observation_space["desired_goal"].shape)  # type: ignore[index]
@@ -221,10 +222,7 @@ def ends_at_goal(env: gym.Env, found: Candidate) -> bool:
 def _horizon(env: gym.Env) -> int:
     steps = None if env.spec is None else env.spec.max_episode_steps
     if steps is None:
-        raise ValueError(
-            "it does not say how long its episodes are; register it with max_episode_steps, or "
-            "wrap it in gymnasium.wrappers.TimeLimit"
-        )
+        raise ValueError(f"it does not say how long its episodes are; {SAY_LENGTH}")
     return checked_whole("max_episode_steps", steps, 1)
 
 

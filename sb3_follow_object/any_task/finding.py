@@ -162,7 +162,7 @@ def find_object(seen: Observed, wanted: str | None = None) -> Candidate:
     if len(free) > 1:
         raise ValueError(
             "several bodies move with the achieved goal: "
-            f"{', '.join(each.name for each in free)}; name one of them as the object"
+            f"{', '.join(each.name for each in free)}; name one of them with object="
         )
     return free[0]
 

@@ -14,6 +14,15 @@ _DEPTH = 4  # attributes of attributes that are looked through
 _LIKELY = ("data", "_data", "sim")  # looked at before others
 
 
+def is_simulated(env: gym.Env) -> bool:
+    """Whether an environment runs a MuJoCo simulation."""
+    try:
+        physics_of(env)
+    except ValueError:
+        return False
+    return True
+
+
 def physics_of(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """Return model and data of the simulation that an environment runs.
 

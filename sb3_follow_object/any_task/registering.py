@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable
 from functools import partial
+from types import FunctionType
 from typing import Any
 
 import gymnasium as gym
 
+from ..envs.goal_envs import SAY_LENGTH
 from ..envs.registration import import_task
 from ..envs.robot_face import EffectorOf, GoalOf, Judge, RobotTask
 
@@ -24,8 +27,12 @@ def registered(
     goal: GoalOf | None = None,
     is_success: Judge | None = None,
     effector: EffectorOf | None = None,
+    named: str | None = None,
 ) -> str:
     """Return the id of an environment, registered with gymnasium where it has none of this kind.
+
+    The same functions have the same id, also where a notebook has written them anew; others of the
+    same name have ids of their own.
 
     Args:
         env_id: gymnasium id; or
@@ -34,13 +41,14 @@ def registered(
         goal: of (env, observation) -> achieved and desired goal; None where observations hold them.
         is_success: of (achieved, desired) -> whether a goal is reached; None asks the environment.
         effector: of (env) -> position of what touches the object; None where observations hold it.
+        named: an id that it had in another process and shall have here.
 
     Returns:
         `env_id` where nothing else is given.
 
     Raises:
-        ValueError: neither or both of id and function are given, or the environment does not say
-            how long its episodes are.
+        ValueError: neither or both of id and function are given, the environment does not say how
+            long its episodes are, or another one is called `named` here.
     """
     if (env_id is None) == (make_env is None):
         raise ValueError("give an environment's id, or make_env, a function that makes it")
@@ -58,12 +66,61 @@ def registered(
     else:
         title = getattr(make_env, "__name__", type(make_env).__name__)
         title, version = re.sub(r"\W+", "", title) or "environment", "0"
-    ours = f"{NAMESPACE}/{title}-v{version}"
+    given = (make_env, *extras)
+    ours = _free_id(title, version, given) if named is None else named
+    if not _alike(_GIVEN.get(ours, given), given):
+        raise ValueError(f"{ours!r} is another environment here; load it in a process of its own")
     horizon = _horizon(make_env, ours)
-    gym.registry.pop(ours, None)  # functions of the same name may have been written anew
+    gym.registry.pop(ours, None)
+    _GIVEN[ours] = given
     entry = partial(_make, make_env, *extras)
     gym.register(ours, entry, max_episode_steps=horizon, disable_env_checker=True)
     return ours
+
+
+_GIVEN: dict[str, tuple[Any, ...]] = {}  # what each id was registered with
+
+
+def made_by_function(env_id: str) -> bool:
+    """Whether an id is one that `registered` gives, and means nothing in another process."""
+    return env_id.startswith(f"{NAMESPACE}/")
+
+
+def _free_id(title: str, version: str, given: tuple[Any, ...]) -> str:
+    """Return the first id of this name that is free, or that these functions have already."""
+    for n in itertools.count(1):
+        ours = f"{NAMESPACE}/{title}{f'-{n}' if n > 1 else ''}-v{version}"
+        if _alike(_GIVEN.get(ours, given), given):
+            return ours
+    raise AssertionError("there is no end of numbers")
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether two things are one, or functions that were written twice in the same words."""
+    if one is other:
+        return True
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(_alike, one, other))
+    if isinstance(one, partial):
+        return _alike(
+            (one.func, one.args, tuple(one.keywords.items())),
+            (other.func, other.args, tuple(other.keywords.items())),
+        )
+    if isinstance(one, FunctionType):
+        return one.__globals__ is other.__globals__ and _alike(_written(one), _written(other))
+    try:
+        return bool(one == other)
+    except Exception:  # what cannot be compared is another thing
+        return False
+
+
+def _written(function: FunctionType) -> tuple[Any, ...]:
+    """What a function does and what it has around it."""
+    cells = tuple(cell.cell_contents for cell in function.__closure__ or ())
+    named = tuple((function.__kwdefaults__ or {}).items())
+    return function.__code__, function.__defaults__, named, cells
 
 
 def _horizon(make_env: MakeEnv, name: str) -> int:
@@ -73,10 +130,7 @@ def _horizon(make_env: MakeEnv, name: str) -> int:
         if steps is None and env.has_wrapper_attr("_max_episode_steps"):  # a TimeLimit by hand
             steps = env.get_wrapper_attr("_max_episode_steps")
         if steps is None:
-            raise ValueError(
-                f"{name} does not say how long its episodes are; wrap it in "
-                "gymnasium.wrappers.TimeLimit"
-            )
+            raise ValueError(f"{name} does not say how long its episodes are; {SAY_LENGTH}")
         return int(steps)
     finally:
         env.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv
@@ -15,7 +16,8 @@ from ..envs.robot_copies import robot_maker
 from ..envs.tasks import SUCCESS_DISTANCE
 from .context import bodies_in
 from .derived import derived, object_horizon, told_effector
-from .finding import find_effector, observe
+from .finding import Effector, find_effector, observe
+from .physics_access import is_simulated
 from .simulation import DerivedObjectVecEnv
 
 SURFACE_STEPS = 120_000  # env steps after which an object left on its surface may leave it
@@ -131,30 +133,50 @@ def steps_of_object(env_id: str, horizon: int) -> int:
     return horizon if env_id in IDS else object_horizon(horizon)
 
 
-def effector_of(env_id: str) -> tuple[int, int, int] | None:
-    """Where a task's observation holds the effector's position; None, it was not found.
+def effector_of(env_id: str) -> tuple[int, int, int]:
+    """Where a task's observation holds the effector's position.
 
     Raises:
-        ValueError: the task's object cannot be followed.
+        ValueError: the task's object cannot be followed, or no part of the robot is told.
     """
-    if env_id in IDS:
-        return 0, 1, 2
-    found = derived(env_id).effector
-    return None if found is None else found.entries
+    return (0, 1, 2) if env_id in IDS else _told(env_id, derived(env_id).effector)
 
 
 def effector_seen_in(env_id: str) -> tuple[int, int, int] | None:
-    """As `effector_of`, of a task of others whose object need not be followed; None, not found."""
+    """As `effector_of`, of a task of others whose object need not be followed.
+
+    Looked at once a process. None, nothing can be seen: there is no MuJoCo simulation, or no goals.
+
+    Raises:
+        ValueError: no part of the robot is told in the observation.
+    """
+    spec = gym.spec(import_task(env_id))
+    key = (spec.id, spec.entry_point, repr(sorted(spec.kwargs.items(), key=str)))
+    if key not in _EFFECTORS:
+        _EFFECTORS[key] = _find_effector(env_id)
+    return _EFFECTORS[key]
+
+
+_EFFECTORS: dict[Any, tuple[int, int, int] | None] = {}
+
+
+def _find_effector(env_id: str) -> tuple[int, int, int] | None:
     env = robot_maker(env_id)()
     try:
-        if missing_goal_keys(env.observation_space):
+        if missing_goal_keys(env.observation_space) or not is_simulated(env):
             return None
-        found = find_effector(observe(env), told_effector(env))
-    except ValueError:  # no MuJoCo
-        return None
+        return _told(env_id, find_effector(observe(env), told_effector(env)))
     finally:
         env.close()
-    return None if found is None else found.entries
+
+
+def _told(env_id: str, found: Effector | None) -> tuple[int, int, int]:
+    if found is None:
+        raise ValueError(
+            f"{env_id!r}: no part of the robot has its position in metres in the observation; "
+            "tell it there with effector=, a function of the environment, or say reach=null"
+        )
+    return found.entries
 
 
 def registered_horizon(env_id: str) -> int | None:

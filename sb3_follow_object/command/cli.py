@@ -329,7 +329,7 @@ def _inspect(args: argparse.Namespace) -> None:
         print(f"{name:<{width}}  {words}")
     if args.out is not None:
         out = _named(args.out, ".png")
-        draw_found(args.env, out)
+        draw_found(args.env, out, args.predictor)
         print(out)
 
 

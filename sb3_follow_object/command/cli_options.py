@@ -74,7 +74,12 @@ def make_parser(commands: Mapping[str, Command]) -> argparse.ArgumentParser:
 
     inspect = subparsers.add_parser("inspect", help="say what is found in a task of others")
     inspect.add_argument("--env", required=True, metavar="ID", help="e.g. FetchPush-v4")
-    inspect.add_argument("--out", type=Path, metavar="FILE.png", help="draw starts and goals")
+    inspect.add_argument(
+        "--out", type=Path, metavar="FILE.png", help="draw starts, goals and imagined goals"
+    )
+    inspect.add_argument(
+        "--predictor", type=Path, metavar="FOLDER", help="that imagines; default: the kept one"
+    )
 
     settings = subparsers.add_parser("settings", help="list what --set can change")
     settings.add_argument(

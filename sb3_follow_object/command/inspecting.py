@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,14 @@ from ..envs import IDS
 from ..envs.goal_space import goal_space
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
-from .pictures import write_png
+from ..imagination.goal_predictor import GoalPredictor
+from ..runs.predictor_cache import kept_predictor
+from .pictures import imagined_panels, write_png
 
 _SECONDS = 1.0  # that a speed is measured for
 _COPIES = 16
 _SHOWN = 60  # starts and goals in the picture
+_EPISODES = 3  # whose imagined goals are drawn beside them
 
 
 def inspect(env_id: str, report: Report) -> dict[str, str]:
@@ -51,14 +55,26 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
     }
 
 
-def draw_found(env_id: str, out: Path) -> None:
+def draw_found(env_id: str, out: Path, predictor: str | os.PathLike[str] | None = None) -> None:
     """Write a picture of a task with some of its starts (blue) and goals (red).
 
+    Beside it episodes with their imagined goals, where an F_phi is given or kept for the task.
+
+    Args:
+        env_id: gymnasium id, with "module:" before it where importing that registers it.
+        out: PNG file to create or replace.
+        predictor: folder of an F_phi; None takes the one that `get_predictor` has kept, if any.
+
     Raises:
+        ValueError: the folder holds no F_phi of this task.
         MissingExtra: imageio is not installed.
         RuntimeError: there is nothing to draw with.
     """
     found = derived(import_task(env_id))
+    if predictor is None:
+        imagines = kept_predictor(found.env_id)
+    else:
+        imagines = GoalPredictor.load(predictor, env_id=found.env_id, physics=found.physics)
     env = robot_maker(found.env_id)()
     try:
         env.reset(seed=0)
@@ -67,9 +83,12 @@ def draw_found(env_id: str, out: Path) -> None:
             for each in (found.resets.starts, found.resets.goals)
         )
         colours = np.repeat([START_RGBA, GOAL_RGBA], [len(starts), len(goals)], axis=0)
-        write_png(out, draw_points(env, np.concatenate([starts, goals]), colours))
+        panels = [draw_points(env, np.concatenate([starts, goals]), colours)]
     finally:
         env.close()
+    if imagines is not None:
+        panels += imagined_panels(found.env_id, imagines, _EPISODES)
+    write_png(out, np.concatenate(panels, axis=1))
 
 
 def _object(found: Derived) -> str:

@@ -84,10 +84,8 @@ def draw_imagined(
 ) -> None:
     """Write a picture of imagined goals in a few episodes (paper, section 4.2).
 
-    The goals lie evenly along the way that F_phi imagines, the first levels dark, the last yellow.
-
     Args:
-        env_id: a task of this package.
+        env_id: a task whose object can be followed.
         predictor: its F_phi.
         out: PNG file to create or replace.
         seed: of the first episode.
@@ -96,10 +94,29 @@ def draw_imagined(
         MissingExtra: imageio is not installed.
         RuntimeError: there is nothing to draw with.
     """
+    write_png(out, np.concatenate(imagined_panels(env_id, predictor, _PANELS, seed), axis=1))
+
+
+def imagined_panels(
+    env_id: str, predictor: GoalPredictor, n_episodes: int, seed: int = 0
+) -> list[np.ndarray]:
+    """Draw episodes that begin, with the goals that F_phi imagines in them.
+
+    The goals lie evenly along the object's way, the first levels dark, the last yellow.
+
+    Args:
+        env_id: a task whose object can be followed.
+        predictor: its F_phi.
+        n_episodes: how many.
+        seed: of the first.
+
+    Raises:
+        RuntimeError: there is nothing to draw with.
+    """
     env = make_drawn(env_id)
     try:
         panels = []
-        for panel in range(_PANELS):
+        for panel in range(n_episodes):
             obs, _ = env.reset(seed=seed + panel)
             way = imagined_way(predictor, obs, read_context(predictor.context, env))
             if env_id in IDS:
@@ -108,7 +125,7 @@ def draw_imagined(
             else:
                 goal = predictor.space.point(obs["desired_goal"][None])
                 panels.append(_imagined_elsewhere(env, way, goal))
-        write_png(out, np.concatenate(panels, axis=1))
+        return panels
     finally:
         env.close()
 

@@ -111,7 +111,7 @@ def reach_in(reach: Any, env_id: str, imagine: bool) -> Any:
         imagine: whether goals are imagined.
 
     Raises:
-        ValueError: goals are imagined, and no part of the robot is told in the observation.
+        ValueError: no part of the robot is told in the observation.
     """
     if not isinstance(reach, Mapping) or env_id in IDS:
         return reach
@@ -120,11 +120,6 @@ def reach_in(reach: Any, env_id: str, imagine: bool) -> Any:
         effector = effector_of(env_id) if imagine else effector_seen_in(env_id)
         if effector is not None:
             found["effector"] = effector
-        elif imagine:
-            raise ValueError(
-                f"{env_id!r}: no part of the robot has its position in metres in the observation; "
-                "tell it there with effector=, a function of the environment, or say reach=null"
-            )
     return {**found, **reach}
 
 

@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..any_task.registering import MakeEnv, registered
+from ..any_task.registering import MakeEnv, made_by_function, registered
 from ..callbacks.curriculum_callback import CurriculumCallback
 from ..callbacks.reach_callback import ReachCallback
 from ..common.numbers import checked_whole
@@ -31,7 +32,7 @@ from ..settings.run_config import check_plain
 from ..settings.stages import StageSettings
 from .checks import check_algorithms, checked_settings, on_table_for, reach_in
 from .robot_stage import RobotStage
-from .saved_folder import Saved, read, write
+from .saved_folder import Saved, read, saved_id, write
 
 
 class FollowObject:
@@ -375,8 +376,17 @@ class FollowObject:
             ValueError: the folder holds no save, or one that is damaged.
         """
         folder = Path(folder)
+        try:
+            env_id = saved_id(folder)
+        except (OSError, KeyError, RecursionError, TypeError, ValueError) as error:
+            raise ValueError(f"{folder} holds no saved FollowObject ({error})") from error
         if environment:
-            registered(**environment)
+            registered(**environment, named=env_id if made_by_function(env_id) else None)
+        elif made_by_function(env_id) and env_id not in gym.registry:
+            raise ValueError(
+                f"{folder} is of an environment that came with functions: give load() make_env= "
+                "and what else FollowObject was given of it"
+            )
         try:
             saved = read(folder)
             run = cls(

@@ -51,6 +51,11 @@ def write(folder: Path, saved: Saved) -> None:
     atomic_write(folder / _SETTINGS, settings)
 
 
+def saved_id(folder: Path) -> str:
+    """Return the id of the environment that a save is of; raises as `read`."""
+    return str(json.loads((folder / _SETTINGS).read_text())["env_id"])
+
+
 def read(folder: Path) -> Saved:
     """Read what `write` wrote.
 

@@ -18,6 +18,7 @@ from ..any_task.tasks import physics_of_task, steps_of_object
 from ..common.answers import check_shape, one_number
 from ..common.copies import WholeCopies
 from ..common.providers import provider
+from ..envs.robot_copies import with_face
 from .curriculum import Curriculum
 from .goal_env import (
     LAST,
@@ -50,7 +51,8 @@ class ImaginedGoalWrapper(
     YAML makes the environment that trains and those that evaluate or play.
 
     Args:
-        env: environment with Dict goal observations, ``compute_reward`` and a success method.
+        env: environment with Dict goal observations. Where gymnasium made it, what it lacks of
+            ``RobotTask`` is added: judging many goals at once, success, rewards of -1 and 0.
         predictor: F_phi; or the folder it was saved in; or "auto", the one that ``get_predictor``
             keeps for this task. The last two are loaded when first needed.
         curriculum: its k_max is read at each reset; or keyword arguments of ``Curriculum`` besides
@@ -72,6 +74,7 @@ class ImaginedGoalWrapper(
         predictor: GoalPredictor | str | os.PathLike[str] = AUTO,
         curriculum: Curriculum | Mapping[str, Any] | None = None,
     ) -> None:
+        env = with_face(env)
         super().__init__(env)
         self._space, self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)
         self._compute_reward = env.get_wrapper_attr("compute_reward")

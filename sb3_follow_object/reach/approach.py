@@ -6,10 +6,12 @@ import copy
 from dataclasses import replace
 from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
+from ..any_task.tasks import effector_seen_in, steps_to_reach
 from ..envs import IDS
 from ..envs.goal_envs import missing_goal_keys
 from ..envs.goal_space import followed_space, goal_space
@@ -150,14 +152,23 @@ def reach_first_settings(
 ) -> ReachFirstSettings:
     """Return a wrapper's settings, the standoff in metres.
 
+    In a task of others effector and steps are those that are found in it, unless they are given;
+    where there is no MuJoCo simulation to look at, the effector is the observation's beginning.
+
     Args:
         given: to the wrapper, by their names.
         who: beginning of the sentence about what cannot be meant.
         spec: of the environment, which says whether its objects are pushed; None says no.
 
     Raises:
-        ValueError: a setting that cannot be meant.
+        ValueError: a setting that cannot be meant, or no part of the robot is told.
     """
+    if spec is not None and spec.id not in IDS and spec.id in gym.registry:
+        given = {"max_steps": steps_to_reach(spec.id), **given}
+        if "effector" not in given:
+            effector = effector_seen_in(spec.id)
+            if effector is not None:
+                given["effector"] = effector
     settings = ReachFirstSettings(**part_of_reach(ReachFirstSettings, given, who))
     if settings.standoff != "auto":
         return settings

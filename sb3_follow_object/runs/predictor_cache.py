@@ -28,7 +28,7 @@ def get_predictor(
     """Return a task's F_phi, learned with the default settings the first time it is asked for.
 
     Args:
-        env_id: a task of this package.
+        env_id: a task of this package, or any other whose object can be followed.
         folder: where the predictor is kept; by default a folder for this task and its physics in
             $SB3_FOLLOW_OBJECT_CACHE or in the user's cache. What is there is read, not written.
         report: called with a sentence now and then while it is learned, which takes minutes.
@@ -36,13 +36,25 @@ def get_predictor(
     Raises:
         ValueError: the folder holds a predictor for another task, other physics or another
             object_on_table, a damaged one, or an object's networks alone; it holds none and cannot
-            be written; or the id is not of this package.
+            be written; or the task's object cannot be followed.
     """
     path = _kept(FACTS_FILE, env_id, folder, report)
     choices = surface_choices(env_id)
     on_table = choices[0] if len(choices) == 1 else None  # else the object's learning has decided
     physics = physics_of_task(env_id)
     return GoalPredictor.load(path.parent, env_id=env_id, physics=physics, object_on_table=on_table)
+
+
+def kept_predictor(env_id: str) -> GoalPredictor | None:
+    """Return the F_phi that `get_predictor` has kept for a task; None, there is none yet.
+
+    Raises:
+        ValueError: the task's object cannot be followed, or what is kept is damaged.
+    """
+    folder = cache_folder() / env_id / kept_as(env_id)
+    if not (folder / FACTS_FILE).exists():
+        return None
+    return GoalPredictor.load(folder, env_id=env_id, physics=physics_of_task(env_id))
 
 
 def get_object_networks(

@@ -99,3 +99,28 @@ def test_an_id_alone_stays_what_it_is() -> None:
 def test_what_cannot_be_meant_is_refused(arguments: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         registered(**arguments)
+
+
+def pushed_arm() -> Any:
+    return TimeLimit(arm_and_wall.ArmAndWall(), 50)
+
+
+def test_the_same_functions_have_one_id_and_others_another() -> None:
+    def made(size: int) -> Any:
+        return lambda: TimeLimit(arm_and_wall.ArmAndWall(), size)
+
+    first = registered(make_env=made(50))
+    assert registered(make_env=made(50)) == first, "written anew in the same words"
+    other = registered(make_env=made(60))
+    assert other != first
+    assert gym.spec(first).max_episode_steps == 50 and gym.spec(other).max_episode_steps == 60
+    assert registered(make_env=pushed_arm) == registered(make_env=pushed_arm)
+
+    def near(achieved: Any, desired: Any) -> Any:
+        return np.linalg.norm(achieved - desired, axis=-1) < 0.01
+
+    judged = registered(arm_and_wall.ARM, is_success=near)
+    assert judged != registered(arm_and_wall.ARM, is_success=lambda achieved, desired: False)
+    assert judged == registered(arm_and_wall.ARM, is_success=near)
+    with pytest.raises(ValueError, match="is another environment here"):
+        registered(make_env=pushed_arm, named=first)

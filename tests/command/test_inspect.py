@@ -10,12 +10,15 @@ import imageio.v3 as imageio
 import moving_wall
 import numpy as np
 import pytest
+from tiny_runs import config, quiet
 
 from sb3_follow_object.any_task import derived as looking
+from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.command import inspecting
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.command.pictures import draw_task
 from sb3_follow_object.common.cache import CACHE_VARIABLE
+from sb3_follow_object.runs.predictor_cache import learn_predictor
 
 ARM = f"arm_and_wall:{arm_and_wall.ARM}"
 
@@ -65,6 +68,22 @@ def test_it_draws_starts_and_goals(can_draw: None, tmp_path: Path) -> None:
     red, green, blue = (image[..., channel] for channel in range(3))
     assert ((red > 2 * green) & (red > 2 * blue) & (red > 40)).sum() > 100, "goals"
     assert ((blue > 2 * red) & (blue > 40)).sum() > 100, "starts"
+
+
+def test_it_draws_imagined_goals_where_there_is_an_f_phi(
+    can_draw: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    predictor = learn_predictor(config(env_id=arm_and_wall.ARM), tmp_path / "phi", quiet)
+    command = ["inspect", "--env", ARM, "--out", str(tmp_path / "arm.png")]
+    assert main(command) == 0
+    assert imageio.imread(tmp_path / "arm.png").shape == (480, 480, 3)
+    assert main([*command, "--predictor", str(tmp_path / "phi")]) == 0
+    assert imageio.imread(tmp_path / "arm.png").shape == (480, 4 * 480, 3)
+    predictor.save(tmp_path / "cache" / arm_and_wall.ARM / kept_as(arm_and_wall.ARM))
+    assert main(command) == 0
+    assert imageio.imread(tmp_path / "arm.png").shape == (480, 4 * 480, 3)
+    assert main([*command, "--predictor", str(tmp_path)]) == 2
+    assert "predictor" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from sb3_follow_object.follow_object.saved_folder import read
 from sb3_follow_object.imagination.predictor_files import FACTS_FILE
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
 from sb3_follow_object.object_stage import stage as stages
+from sb3_follow_object.reach.wrapper import ReachFirstWrapper
 from sb3_follow_object.runs import predictor_cache
 from sb3_follow_object.settings.presets import run_config
 
@@ -49,6 +50,91 @@ def test_a_save_goes_on_as_the_whole_does(tmp_path: Path) -> None:
     assert whole.model is not None and resumed.model is not None
     assert resumed.env_steps == whole.env_steps > part.env_steps
     th.testing.assert_close(weights(resumed.model), weights(whole.model), rtol=0, atol=0)
+
+
+def test_a_save_of_an_environment_that_a_function_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made() -> gym.Env:
+        return TimeLimit(arm_and_wall.ArmAndWall(), 50)  # type: ignore[attr-defined]
+
+    run = FollowObject(make_env=made, imagine=False, **TINY).learn(400)
+    run.save(tmp_path / "run")
+    monkeypatch.delitem(gym.registry, run.env_id)  # as in another process
+    with pytest.raises(ValueError, match="came with functions: give load\\(\\) make_env="):
+        FollowObject.load(tmp_path / "run")
+    again = FollowObject.load(tmp_path / "run", make_env=made)
+    assert (again.env_id, again.env_steps) == (run.env_id, run.env_steps)
+    with pytest.raises(ValueError, match="is another environment here"):
+        FollowObject.load(tmp_path / "run", make_env=lambda: made())
+
+
+@pytest.mark.parametrize(
+    ("env_id", "sentence"),
+    [
+        ("CartPole-v1", "has no goals: .*; say with goal= and is_success="),
+        ("Endless-v0", "does not say how long its episodes are; register it with max_episode_st"),
+    ],
+)
+def test_what_is_missing_is_said_at_once(env_id: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        FollowObject(env_id, **TINY)
+
+
+class Paid(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
+    """Pays 1 on the goal, for one goal at a time, and does not tell success."""
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        return float(np.linalg.norm(achieved - desired) < 0.05)
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, _, terminated, truncated, _ = super().step(action)
+        reward = self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})
+        return obs, reward, terminated, truncated, {}
+
+
+gym.register("Paid-v0", Paid, max_episode_steps=50)
+gym.register("Endless-v0", arm_and_wall.ArmAndWall)
+
+
+def test_the_wrappers_find_what_follow_object_finds() -> None:
+    def tip(env: Any) -> np.ndarray:
+        return env.data.site("tip").xpos
+
+    env_id = FollowObject("Paid-v0", effector=tip, **TINY).env_id
+    reaching = ReachFirstWrapper(gym.make(env_id))
+    expected = FollowObject("Paid-v0", effector=tip, **TINY, reach={}).settings["reach"]
+    found = reaching.reach_settings()
+    assert tuple(found.effector) == tuple(expected["effector"]) == (21, 22, 23)
+    assert found.max_steps == expected["max_steps"] == 25
+    assert ReachFirstWrapper(gym.make(env_id), max_steps=7).reach_settings().max_steps == 7
+
+    env = ImaginedGoalWrapper(gym.make("Paid-v0"), curriculum={"p": 0.0})
+    obs, _ = env.reset(seed=0)
+    _, reward, _, _, info = env.step(env.action_space.sample())
+    assert reward == -1.0 and info["is_success"] is False
+    goals = np.tile(obs["desired_goal"], (3, 1))
+    paid = env.get_wrapper_attr("compute_reward")(
+        goals, goals + np.array([[0.0], [0.1], [0.0]]), {}
+    )
+    np.testing.assert_array_equal(paid, [0.0, -1.0, 0.0])
+
+
+class Told(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
+    """Tells nothing of the robot in metres."""
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        told = super()._observation()
+        return {**told, "observation": 10.0 * told["observation"]}
+
+
+gym.register("Told-v0", Told, max_episode_steps=50)
+
+
+def test_a_wrapper_that_finds_no_effector_says_so() -> None:
+    with pytest.raises(ValueError, match="no part of the robot has its position in metres"):
+        ReachFirstWrapper(gym.make("Told-v0"))
+    assert ReachFirstWrapper(gym.make("Told-v0"), effector=(0, 1, 2)).reach_settings()
 
 
 def test_reaching_takes_what_a_task_of_others_says_of_it() -> None:
