@@ -144,6 +144,7 @@ class DeviceReplay(WholeCopies):
         stored = {*buffer.records.views(), ACHIEVED, NEXT_DESIRED}
         reasons = {
             "imagined_ratio > 0": buffer.imagined_ratio > 0.0,
+            "scene_distance > 0": buffer.scene_distance > 0.0,
             "cher": buffer.selection is not None,
             "reward_function": buffer.reward_function is not None,
             "copy_info_dict": buffer.copy_info_dict,

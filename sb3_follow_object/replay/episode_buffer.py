@@ -17,6 +17,7 @@ from .record_buffer import Gathered, RecordReplayBuffer
 from .steps import lost_steps
 
 GRAVITY = 9.81  # m/s^2
+_GOALS_MET = 1000  # of the first episodes; they say where goals lie
 EXECUTED = "executed_action"  # in an info: what was done in place of the action given
 
 
@@ -29,9 +30,12 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
     moved_priority: str
     step_seconds: float
     min_goal_distance: float
+    scene_distance: float
     original_goals: np.ndarray
     contexts = np.zeros((0, 0, 0), dtype=np.float32)
     _far: np.ndarray
+    _amiss = np.zeros(0, dtype=bool)
+    _goals_met: np.ndarray
     rng: np.random.Generator
     table: EpisodeTable
     n_added: int
@@ -82,8 +86,11 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         self.ep_start[pos] = self._current_ep_start
         if self.copy_info_dict:
             self.infos[pos] = infos
-        if self.imagined_ratio > 0.0:
-            self.original_goals[pos] = [info["original_goal"] for info in infos]
+        if self.original_goals.size:
+            shown = obs["desired_goal"]
+            self.original_goals[pos] = [
+                info.get("original_goal", goal) for info, goal in zip(infos, shown, strict=True)
+            ]
             if self.contexts.size:
                 self.contexts[pos] = [info["context"] for info in infos]
         self.pos = (pos + 1) % self.buffer_size
@@ -163,7 +170,20 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         if self.min_goal_distance > 0.0:
             distance = self.goal_space.distance(path, origin)
             self._far[slots, env_idx] = distance >= self.min_goal_distance
+        if self.scene_distance > 0.0:
+            self._amiss[slots, env_idx] = self._is_amiss(path, self.original_goals[start, env_idx])
         self.table.insert(start, env_idx, length, self._priority(origin, path))
+
+    def _is_amiss(self, path: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Whether places (n, d) are where earlier episodes' goals lay, not by their own (d,)."""
+        if len(self._goals_met) < _GOALS_MET:
+            self._goals_met = np.concatenate([self._goals_met, goal[None]])
+        distance = self.goal_space.distance
+        others = distance(path[:, None], self._goals_met[None]).min(axis=1)
+        amiss: np.ndarray = (others < self.scene_distance) & (
+            distance(path, goal) >= self.scene_distance
+        )
+        return amiss
 
     def _priority(self, origin: np.ndarray, path: np.ndarray) -> float:
         """Priority of an episode from where the achieved goal began (d,) and went (length, d)."""

@@ -52,6 +52,11 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         min_goal_distance: metres; a hindsight goal nearer than this to where the episode's achieved
             goal began was reached before anything was done. Such a transition keeps the goal that
             was shown, so that episodes that moved nothing do not teach to stay. 0 is the paper's.
+        scene_distance: metres; hindsight takes it that all would have gone the same way had the
+            goal been another. Where something stands around each goal, as a tube or a shelf does,
+            it would not have: a hindsight goal that lies within this of where earlier episodes'
+            goals lay, but not of its own episode's, is then not used. That begins once imagined
+            goals are over, around which nothing stands. 0 is the paper's.
         goal_margin: share in [0, 1) of the tolerance at whose outer edge a goal does not count as
             reached in what is learned from: a policy whose actions have a price moves the object as
             little as will do, and what stops at the edge often stops beyond it. For environments
@@ -71,7 +76,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             wrapper that imagines them, or, at the first step, an episode does not fit.
     """
 
-    goal_margin = 0.0  # of buffers pickled before there was one
+    goal_margin = scene_distance = 0.0  # of buffers pickled before there were any
 
     def __init__(
         self,
@@ -92,6 +97,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         moved_priority: str = ReplaySettings.moved_priority,
         step_seconds: float = ReplaySettings.step_seconds,
         min_goal_distance: float = ReplaySettings.min_goal_distance,
+        scene_distance: float = ReplaySettings.scene_distance,
         goal_margin: float = ReplaySettings.goal_margin,
         cher: dict[str, Any] | None = None,
         reward_function: RewardFunction | None = None,
@@ -108,6 +114,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             moved_priority=moved_priority,  # type: ignore[arg-type]  # a word is checked there
             step_seconds=step_seconds,
             min_goal_distance=min_goal_distance,
+            scene_distance=scene_distance,
             goal_margin=goal_margin,
             cher=cher,
             seed=seed,
@@ -133,6 +140,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         self.moved_priority = settings.moved_priority
         self.step_seconds = settings.step_seconds
         self.min_goal_distance = settings.min_goal_distance
+        self.scene_distance = settings.scene_distance
         self.goal_margin = settings.goal_margin
         self.selection = None if settings.cher is None else GoalSelection(**settings.cher)
         self.reward_function = reward_function
@@ -150,13 +158,15 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             np.random.randint(2**31) if settings.seed is None else settings.seed
         )
 
-        self.original_goals = np.zeros(
-            goal_shape if self.imagined_ratio > 0.0 else (0,), dtype=np.float32
-        )
+        keeps_goals = self.imagined_ratio > 0.0 or self.scene_distance > 0.0
+        self.original_goals = np.zeros(goal_shape if keeps_goals else (0,), dtype=np.float32)
         if not self.copy_info_dict:
             self.infos = np.empty((0, n_envs), dtype=object)  # one unused dict a slot otherwise
         # Whether what a slot achieved is far enough from where its episode began.
         self._far = np.zeros(self.dones.shape if self.min_goal_distance > 0.0 else (0,), dtype=bool)
+        # Whether that is where other episodes' goals lie and its own does not.
+        self._amiss = np.zeros(self.dones.shape if self.scene_distance > 0.0 else (0,), dtype=bool)
+        self._goals_met = np.zeros((0, *goal_shape[2:]), dtype=np.float32)
         self.table = EpisodeTable()
         self.revision = 0  # counts contents that were loaded over the earlier ones
 
@@ -217,6 +227,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             "table": self.table.state_dict(),
             "rng": self.rng.bit_generator.state,
             "selection": None if self.selection is None else self.selection.state_dict(),
+            **({"goals_met": self._goals_met} if self.scene_distance > 0.0 else {}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -241,18 +252,20 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         self._current_ep_start = state["current_episode_start"].copy()
         self.table.load_state_dict(state["table"])
         self.rng.bit_generator.state = state["rng"]
+        if self.scene_distance > 0.0:
+            self._goals_met = np.array(state["goals_met"], dtype=np.float32)
         if self.selection is not None:
             self.selection.load_state_dict(state["selection"])
 
     def _stores(self) -> dict[str, np.ndarray]:
         stores = super()._stores()
-        if self.imagined_ratio > 0.0:
-            stores["original_goals"] = self.original_goals
-            if self.contexts.size:
-                stores["contexts"] = self.contexts
-        if self.min_goal_distance > 0.0:
-            stores["far"] = self._far
-        return stores
+        of_size = {
+            "original_goals": self.original_goals,
+            "contexts": self.contexts,
+            "far": self._far,
+            "amiss": self._amiss,
+        }
+        return stores | {name: store for name, store in of_size.items() if store.size}
 
     def selection_log(self) -> dict[str, float]:
         """Return what there is to log about how batches are chosen."""
@@ -307,9 +320,9 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         steps_to_goal = np.full(batch_size, np.inf, dtype=np.float32)
         virtual = np.flatnonzero(self.rng.random(batch_size) < self.her_ratio)
         relabelled = episode.take(virtual, axis=0)
-        goals, steps, far = self._hindsight_goals(relabelled, step.take(virtual))
-        if far is not None:
-            kept = np.flatnonzero(far)
+        goals, steps, usable = self._hindsight_goals(relabelled, step.take(virtual))
+        if usable is not None:
+            kept = np.flatnonzero(usable)
             virtual, steps = virtual.take(kept), steps.take(kept)
             goals = goals.take(kept, axis=0)
         goals = self._goals_in(goals)
@@ -360,8 +373,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         """Achieved goals of the same episode, by the strategy, not yet cut to (n, d).
 
         Second, the steps from the transition to the one that achieved the goal (n,), float;
-        infinite for goals of the past. Third, if that matters, whether the goal lies far enough
-        from where the episode began (n,).
+        infinite for goals of the past. Third, if not all are, which goals are of use (n,).
         """
         length = episode[:, 2]
         if self.goal_selection_strategy == GoalSelectionStrategy.FINAL:
@@ -374,8 +386,21 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         steps = (chosen - step).astype(np.float32)
         if self.goal_selection_strategy == GoalSelectionStrategy.EPISODE:
             steps[steps < 0] = np.inf
+        return self._achieved_goals(flat), steps, self._usable(flat)
+
+    def _usable(self, flat: np.ndarray) -> np.ndarray | None:
+        """Which of these transitions' achieved goals may be hindsight goals (n,); None, all."""
         far = self._take(self._far, flat) if self.min_goal_distance > 0.0 else None
-        return self._achieved_goals(flat), steps, far
+        if self.scene_distance == 0.0 or self._imagines():
+            return far
+        as_asked = ~self._take(self._amiss, flat)
+        return as_asked if far is None else far & as_asked
+
+    def _imagines(self) -> bool:
+        """Whether imagined goals are shown, around which nothing stands."""
+        if self.env is None or not self.env.has_attr("curriculum"):
+            return False
+        return not self.env.get_attr("curriculum", indices=[0])[0].finished
 
     def _imagined_goals(self, episode: np.ndarray) -> np.ndarray:
         """F_phi(o_1, g, k) of each episode at a level that it could have shown, (n, d)."""

@@ -79,6 +79,15 @@ class ReplaySettings(Group):
         Number,
         setting("a hindsight goal nearer to the start than this is not used", unit="metres", ge=0),
     ] = 0.0
+    scene_distance: Annotated[
+        Number,
+        setting(
+            "nearer to another episode's goal than this, and not to its own, a hindsight goal is "
+            "not used once imagined goals are over; where things stand around goals",
+            unit="metres",
+            ge=0,
+        ),
+    ] = 0.0
     goal_margin: Annotated[
         Number, setting("share of the tolerance that is not good enough in replay", ge=0, lt=1)
     ] = 0.0

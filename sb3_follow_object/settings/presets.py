@@ -36,6 +36,7 @@ _TOLERANCES = (
     ("curriculum", "min_distance"),
     ("replay_buffer_kwargs", "moved_distance"),
     ("replay_buffer_kwargs", "min_goal_distance"),
+    ("replay_buffer_kwargs", "scene_distance"),
 )
 _HORIZON = 50  # steps of the episodes that presets give updates and tests for
 # The package's task that one of one's own is set up as, by whether its object is pushed.

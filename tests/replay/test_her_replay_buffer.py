@@ -164,6 +164,58 @@ def test_imagined_ratio_shows_no_level_that_training_would_not() -> None:
         assert far.min() > nearest - 1e-5 and far.max() < 0.2 + 1e-5
 
 
+@pytest.mark.parametrize("imagines", [False, True])
+def test_hindsight_goals_where_other_goals_lie_are_left_out(imagines: bool) -> None:
+    goals = np.array([[0.2, 0.0, 0.0], [0.0, 0.2, 0.0]])
+
+    class TwoGoals(PointEnv):
+        """Goes to one of two places, whichever of them is asked."""
+
+        episodes = 0
+
+        def reset(self, **options: Any) -> Any:
+            super().reset(**options)
+            self.position = np.zeros(3)
+            self.goal = goals[self.episodes % 2]
+            self.episodes += 1
+            return self._observe(), {}
+
+        def step(self, action: np.ndarray) -> Any:
+            return super().step(np.array([0.0, 1.0, 0.0]) if self.steps < 4 else np.zeros(3))
+
+    env: Any = make_env(1, TwoGoals)
+    if imagines:
+        curriculum = Curriculum(HORIZON, k_max=1)
+        env = ImaginedGoalVecEnv(env, StraightPredictor(), curriculum)
+    buffer = make_buffer(env, scene_distance=0.04, n_sampled_goal=10**9)
+    fill([buffer], env, 20 * HORIZON)
+    np.testing.assert_allclose(np.unique(buffer._goals_met, axis=0), np.unique(goals, axis=0))
+
+    def relabelled_to_the_second() -> np.ndarray:
+        """How many of each goal's transitions are relabelled with where the second goal is."""
+        row, step = buffer._draw(4000)
+        episode = buffer.table.facts[row]
+        achieved, _, usable = buffer._hindsight_goals(episode, step)
+        of_first = (buffer.original_goals[episode[:, 0], 0] == np.float32(goals[0])).all(axis=1)
+        there = np.linalg.norm(achieved[:, :3] - goals[1], axis=1) < 0.01
+        there &= episode[:, 0] > HORIZON  # the first episode did not know of the second goal
+        usable = np.ones(len(row), bool) if usable is None else usable
+        return np.array([(of_first & there & usable).sum(), (~of_first & there & usable).sum()])
+
+    if imagines:
+        assert (relabelled_to_the_second() > 100).all(), "nothing stands around imagined goals"
+        curriculum.k_max = curriculum.n_levels
+    of_the_first, of_the_second = relabelled_to_the_second()
+    assert of_the_first == 0 and of_the_second > 100
+    goal = as_arrays(buffer.sample(2000))["goal"]
+    assert np.isfinite(goal).all()
+
+    other = make_buffer(env, scene_distance=0.04, n_sampled_goal=10**9)
+    other.load_state_dict(buffer.state_dict())
+    fill([buffer, other], env, 2 * HORIZON, seed=1)
+    np.testing.assert_array_equal(buffer._amiss, other._amiss)
+
+
 def test_a_state_may_take_the_place_of_more_than_it_holds() -> None:
     env = make_env()
     buffer, fuller = make_buffer(env, size=100), make_buffer(env, size=100)

@@ -376,7 +376,9 @@ THINGS: dict[str, tuple[Make, Use]] = {
     "Curriculum": (lambda: toy.curriculum(k_max=3), use_curriculum),
     "FollowObjectReplayBuffer": (filled_buffer, use_buffer),
     "FollowObjectReplayBuffer with all": (
-        lambda: filled_buffer(moved_ratio=0.5, min_goal_distance=0.05, cher={}),
+        lambda: filled_buffer(
+            moved_ratio=0.5, min_goal_distance=0.05, scene_distance=0.05, cher={}
+        ),
         use_buffer,
     ),
     "Records": (records, use_records),
