@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from ..common.answers import check_shape, one_each, one_number
 from ..common.numbers import checked_whole
 from ..ddpg.her_ddpg import HerDDPG
-from ..imagination.goal_env import terminal_observation
+from ..imagination.goal_env import with_terminal_observations
 
 Observation = dict[str, np.ndarray]
 Policy = Callable[[Observation], np.ndarray]
@@ -40,26 +40,6 @@ class Episodes:
     def success_rate(self) -> float:
         """Share of the episodes that ended on the goal shown."""
         return float(self.success.mean())
-
-
-def with_terminal_observations(
-    obs: Observation, dones: np.ndarray, infos: list[dict[str, Any]]
-) -> Observation:
-    """Return the observations that the step led to, undoing the automatic reset.
-
-    Args:
-        obs: observation of each copy after the step, of a new episode where `dones`.
-        dones: (n_envs,) bool.
-        infos: one dict a copy, with `terminal_observation` where done.
-    """
-    if not dones.any():
-        return obs
-    obs = {key: value.copy() for key, value in obs.items()}
-    for i in np.flatnonzero(dones):
-        for key, value in terminal_observation(infos[i]).items():
-            check_shape(value, obs[key][i].shape, f"the terminal observation {key!r}")
-            obs[key][i] = value
-    return obs
 
 
 def run_episodes(

@@ -390,11 +390,7 @@ class HerDDPG(KeptDDPG):
 
     def _trained_parameters(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
         """Parameters of the live and of the target networks, in the same order."""
-        live: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
-        target: list[th.Tensor] = [
-            *self.actor_target.parameters(),
-            *self.critic_target.parameters(),
-        ]
+        live, target = self.policy.live_and_targets()
         if self.auxiliary_critic is not None:
             live += self.auxiliary_critic.q_networks.parameters()
             target += self.auxiliary_critic.target_networks.parameters()

@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 
 # Floor of the standard deviations, so that entries that hardly vary are not blown up.
-_MIN_STD = 0.01
+MIN_STD = 0.01
 
 
 class InputMoments(RunningMeanStd):
@@ -27,7 +27,7 @@ class InputMoments(RunningMeanStd):
     @property
     def std(self) -> np.ndarray:
         """Standard deviations (n_features,), none too small to divide by."""
-        return np.sqrt(self.var).clip(min=_MIN_STD)
+        return np.sqrt(self.var).clip(min=MIN_STD)
 
     def take(self, buffer: ReplayBuffer) -> bool:
         """Take in what was stored since the last call; goals count as shown and as achieved.

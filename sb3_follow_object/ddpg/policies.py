@@ -151,6 +151,15 @@ class HerPolicy(WholeModule, TD3Policy):
         critic_class = LayerNormCritic if self.critic_layer_norm else ContinuousCritic
         return critic_class(**critic_kwargs).to(self.device)
 
+    def live_and_targets(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
+        """Return the parameters of the live and of the target networks, in the same order."""
+        live: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
+        target: list[th.Tensor] = [
+            *self.actor_target.parameters(),
+            *self.critic_target.parameters(),
+        ]
+        return live, target
+
     def set_moments(self, mean: th.Tensor, std: th.Tensor) -> None:
         """Give every network the same moments, (features_dim,) each."""
         actors = (self.actor, self.actor_target, self.actor_average)

@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 from gymnasium import spaces
 
+from ..common.answers import check_shape
 from ..envs.goal_envs import SUCCESS_METHODS, missing_goal_keys
 from ..envs.goal_space import GoalSpace, followed_space
 from .curriculum import Curriculum
@@ -64,6 +65,26 @@ def terminal_observation(info: dict[str, Any]) -> Observation:
             f"episode, but {last!r}; it must hold the last observation, as a dict"
         )
     return last
+
+
+def with_terminal_observations(
+    obs: Observation, dones: np.ndarray, infos: list[dict[str, Any]]
+) -> Observation:
+    """Return the observations that the step led to, undoing the automatic reset.
+
+    Args:
+        obs: observation of each copy after the step, of a new episode where `dones`.
+        dones: (n_envs,) bool.
+        infos: one dict a copy, with `terminal_observation` where done.
+    """
+    if not dones.any():
+        return obs
+    obs = {key: value.copy() for key, value in obs.items()}
+    for i in np.flatnonzero(dones):
+        for key, value in terminal_observation(infos[i]).items():
+            check_shape(value, obs[key][i].shape, f"the terminal observation {key!r}")
+            obs[key][i] = value
+    return obs
 
 
 def check_goal_stays(given: np.ndarray, original: np.ndarray) -> None:

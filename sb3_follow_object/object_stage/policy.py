@@ -139,7 +139,7 @@ class StopWhenSolved(CopyableCallback):
 def train_object_policy(
     env: VecEnv,
     test_env: VecEnv,
-    total_timesteps: int = 400_000,
+    total_timesteps: int = StageSettings.object_timesteps,
     *,
     n_test_episodes: int = StageSettings.object_test_episodes,
     test_every: int = StageSettings.object_test_every,

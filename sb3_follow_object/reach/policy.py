@@ -18,6 +18,7 @@ from torch import nn
 from ..common.copies import WholeCopies
 from ..common.torch_helpers import usual_defaults
 from ..ddpg.auxiliary import AuxiliaryCritic, Transitions
+from ..ddpg.input_moments import MIN_STD
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
 from ..ddpg.updates import Updates
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
@@ -25,7 +26,6 @@ from ..settings.stages import ReachFirstSettings
 from .actor import ReachActor
 from .approach import check_effector
 
-_MIN_STD = 0.01  # floor of the inputs' standard deviations
 _HIDDEN = [128, 128]
 _TO_OBJECT = 0.2  # share of the goals at which the object stood
 _IDLE = 0.1  # standard deviation of an action's entry below which reaching does not need it
@@ -36,7 +36,7 @@ def _learning_rate(progress: float) -> float:
 
 
 class ReachPolicy(WholeCopies):
-    """DDPG + HER on the effector's position, from the robot's own replay buffer.
+    """DDPG + HER with two critics on the effector's position, from the robot's own replay buffer.
 
     Args:
         observation_space: of the environment, Dict with "observation".
@@ -76,7 +76,9 @@ class ReachPolicy(WholeCopies):
         )
         with usual_defaults(), th.random.fork_rng(devices=[]):
             th.manual_seed(seed)
-            self.policy = HerPolicy(inputs, action_space, _learning_rate, net_arch=_HIDDEN)
+            self.policy = HerPolicy(
+                inputs, action_space, _learning_rate, net_arch=_HIDDEN, n_critics=2
+            )
         self.moments = RunningMeanStd(shape=(self.policy.actor.features_dim,))
         self.idle = np.zeros(action_space.shape, dtype=bool)
         self._n_updates = 0
@@ -136,7 +138,7 @@ class ReachPolicy(WholeCopies):
         )
 
     def _std(self) -> np.ndarray:
-        return np.sqrt(self.moments.var).clip(min=_MIN_STD)
+        return np.sqrt(self.moments.var).clip(min=MIN_STD)
 
     def _sample(self, buffer: FollowObjectReplayBuffer, n: int) -> tuple[np.ndarray, ...]:
         """Draw transitions and places: observations, places, actions, next, steps, reached."""
@@ -156,12 +158,7 @@ class ReachPolicy(WholeCopies):
         return -1.0 / (1.0 - self.gamma), 0.0
 
     def _trained_parameters(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
-        live: list[th.Tensor] = [*self.policy.actor.parameters(), *self.policy.critic.parameters()]
-        target: list[th.Tensor] = [
-            *self.policy.actor_target.parameters(),
-            *self.policy.critic_target.parameters(),
-        ]
-        return live, target
+        return self.policy.live_and_targets()
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next updates depend on."""

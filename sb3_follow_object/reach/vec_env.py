@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import (
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from ..common.vec_env_copies import CopyableVecEnvWrapper
-from ..imagination.goal_env import LAST
+from ..imagination.goal_env import LAST, with_terminal_observations
 from ..imagination.vec_env import ImaginedGoalVecEnv
 from ..replay.episode_buffer import EXECUTED
 from ..settings.stages import ReachFirstSettings
@@ -99,13 +99,7 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
         """Finish the step and tell what was executed."""
         venv_obs, rewards, dones, infos = self.venv.step_wait()
         obs = cast(Observation, venv_obs)
-        last = obs
-        if dones.any():
-            last = {key: value.copy() for key, value in obs.items()}
-            for i in np.flatnonzero(dones):
-                for key in ("observation", "achieved_goal"):
-                    last[key][i] = infos[i]["terminal_observation"][key]
-        self.approach.arrive(last, dones)
+        self.approach.arrive(with_terminal_observations(obs, dones, infos), dones)
         infos = [
             {**info, EXECUTED: action} for info, action in zip(infos, self._executed, strict=True)
         ]

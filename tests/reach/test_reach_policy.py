@@ -13,8 +13,8 @@ from reaching import HORIZON, REACH, TASK
 from small_buffers import as_arrays
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_follow_object.callbacks.rollout import with_terminal_observations
 from sb3_follow_object.envs import make_vec
+from sb3_follow_object.imagination.goal_env import with_terminal_observations
 from sb3_follow_object.reach.policy import ReachPolicy
 from sb3_follow_object.reach.vec_env import ReachFirstVecEnv
 from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer

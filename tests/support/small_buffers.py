@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy import PointEnv
 
-from sb3_follow_object.callbacks.rollout import with_terminal_observations
+from sb3_follow_object.imagination.goal_env import with_terminal_observations
 from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
 
 
