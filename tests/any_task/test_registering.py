@@ -11,8 +11,14 @@ import pytest
 import toy
 from gymnasium.wrappers import TimeLimit
 
+from sb3_follow_object.any_task import registering
 from sb3_follow_object.any_task.registering import registered
 from sb3_follow_object.envs.robot_copies import robot_maker
+
+
+@pytest.fixture(autouse=True)
+def no_ids_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registering, "_GIVEN", {})
 
 
 def make_my_arm() -> gym.Env:
