@@ -16,7 +16,7 @@ class Curriculum:
 
     Each episode shows its original goal with probability ``p`` and otherwise the imagined goal of
     a level k drawn from U{1..k_max}. A test at level k_max that reaches ``threshold`` raises k_max
-    by one, or by up to ``stride``. Once the last level that is shown is reached (and passed, with
+    by one, or by up to ``stride``. Once the last level is reached (and passed, with
     ``finish_threshold``) the curriculum is finished and shows original goals only.
 
     Args:
@@ -27,8 +27,6 @@ class Curriculum:
             that chance cannot pass it; otherwise each stands alone (paper).
         stride: most levels that a test raises k_max by, >= 1: as many as its success rate holds the
             threshold, so that what is learned at once need not wait for a test of every level.
-        finish_share: share of the levels that are shown, in (0, 1]: the last ones may be as hard as
-            the original goals, and F_phi's errors harder. 1 is the paper's.
         finish_threshold: success rate at the last level that ends the curriculum, in [0, 1]; until
             then imagined goals of all levels go on. 0 is the paper's: reaching that level ends it.
         k_max: first value of k_max, in 1..n_levels.
@@ -42,7 +40,7 @@ class Curriculum:
         ValueError: an argument is outside its range.
     """
 
-    stride, finish_share = 1, 1.0  # of those pickled before there were any
+    stride = 1  # of those pickled before there was one
 
     def __init__(
         self,
@@ -52,7 +50,6 @@ class Curriculum:
         threshold: float = CurriculumSettings.threshold,
         sequential: bool = CurriculumSettings.sequential,
         stride: int = CurriculumSettings.stride,
-        finish_share: float = CurriculumSettings.finish_share,
         finish_threshold: float = CurriculumSettings.finish_threshold,
         k_max: int = CurriculumSettings.k_max,
         levels: str = CurriculumSettings.levels,
@@ -65,7 +62,6 @@ class Curriculum:
             threshold=threshold,
             sequential=sequential,
             stride=stride,
-            finish_share=finish_share,
             finish_threshold=finish_threshold,
             k_max=k_max,
             levels=levels,  # type: ignore[arg-type]  # a word is checked there
@@ -79,7 +75,6 @@ class Curriculum:
         self.p = settings.p
         self.threshold = settings.threshold
         self.stride = settings.stride
-        self.finish_share = settings.finish_share
         self.finish_threshold = settings.finish_threshold
         self.sampling = settings.sampling
         self.min_distance = settings.min_distance
@@ -88,14 +83,9 @@ class Curriculum:
         self._tests = SequentialTest() if settings.sequential else None
 
     @property
-    def last_level(self) -> int:
-        """The last level that is shown."""
-        return max(1, round(self.finish_share * self.n_levels))
-
-    @property
     def finished(self) -> bool:
         """Whether the last level is passed, so that only original goals are shown."""
-        at_last = self.k_max >= self.last_level
+        at_last = self.k_max == self.n_levels
         return at_last and (self._passed_last or self.finish_threshold == 0.0)
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -135,7 +125,7 @@ class Curriculum:
         n_episodes = checked_whole("n_episodes", n_episodes, 1)
         if self.finished:
             return False
-        at_last = self.k_max >= self.last_level
+        at_last = self.k_max == self.n_levels
         threshold = self.finish_threshold if at_last else self.threshold
         if self._tests is None:
             passed = success_rate >= threshold
@@ -147,7 +137,7 @@ class Curriculum:
             self._passed_last = True
         else:
             held = int(success_rate / threshold + 1e-9) if threshold > 0.0 else 1
-            self.k_max = min(self.last_level, self.k_max + min(max(1, held), self.stride))
+            self.k_max = min(self.n_levels, self.k_max + min(max(1, held), self.stride))
         return True
 
     def state_dict(self) -> dict[str, Any]:

@@ -29,9 +29,6 @@ class CurriculumSettings(Group):
         Whole,
         setting("most levels that a passed test raises k_max by, one for each threshold", ge=1),
     ] = 1
-    finish_share: Annotated[
-        Number, setting("share of the levels that are shown; reaching it ends them", gt=0, le=1)
-    ] = 1.0
     finish_threshold: Annotated[
         Number,
         setting("success rate at the last level that ends the curriculum; 0, none", ge=0, le=1),

@@ -224,17 +224,6 @@ def test_finish_threshold_keeps_imagining_until_the_last_level_is_passed() -> No
     assert resumed.finished and not resumed.report(1.0)
 
 
-def test_finish_share_ends_the_levels_before_the_last() -> None:
-    curriculum = Curriculum(50, levels="path", finish_share=0.88, stride=4, p=0.0, k_max=20)
-    assert curriculum.last_level == 22 and curriculum.n_levels == 25
-    assert curriculum.report(1.0) and curriculum.k_max == 22, "no level beyond it is shown"
-    assert curriculum.finished and curriculum.draw(100, np.random.default_rng(0))[0].all()
-    with_test = Curriculum(10, finish_share=0.5, finish_threshold=0.5, k_max=4, p=0.0)
-    assert with_test.report(1.0) and with_test.k_max == 5 and not with_test.finished
-    assert with_test.report(0.5) and with_test.finished
-    assert Curriculum(10, finish_share=0.01).last_level == 1
-
-
 def sequential(**settings: Any) -> Curriculum:
     return Curriculum(50, levels="path", n_levels=25, sequential=True, **settings)
 
