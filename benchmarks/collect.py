@@ -154,7 +154,7 @@ def in_the_end(rows: list[Row]) -> str:
     stopped = [row["validations"][-1] for row in rows if "success_rate" not in row]
     said = []
     if final:
-        spread = f" ({span(final)})" if len(final) > 1 else ""
+        spread = f" ({ends})" if " to " in (ends := span(final)) else ""
         said = [f"{median(final):.2f}{spread}"]
     if stopped:
         rates = span([v["success_rate"] for v in stopped])
