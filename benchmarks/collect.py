@@ -154,7 +154,8 @@ def in_the_end(rows: list[Row]) -> str:
     stopped = [row["validations"][-1] for row in rows if "success_rate" not in row]
     said = []
     if final:
-        spread = f" ({ends})" if " to " in (ends := span(final)) else ""
+        ends = span(final)
+        spread = f" ({ends})" if " to " in ends else ""
         said = [f"{median(final):.2f}{spread}"]
     if stopped:
         rates = span([v["success_rate"] for v in stopped])

@@ -39,12 +39,7 @@ def check_task(env_id: str) -> str:
     except Exception as error:  # an environment of somebody's may raise anything
         raise ValueError(f"{env_id!r} cannot be made: {error or type(error).__name__}") from error
     try:
-        missing = missing_goal_keys(env.observation_space)
-        if missing:
-            lacking = ", ".join(missing)
-            raise ValueError(
-                f"{env_id!r} has no goals: its observations lack {lacking}; {SAY_GOALS} (RobotTask)"
-            )
+        check_goal_keys(env.observation_space, repr(env_id))
         if env.spec is None or env.spec.max_episode_steps is None:
             raise ValueError(f"{env_id!r} does not say how long its episodes are; {SAY_LENGTH}")
         if _hides_success(env) and not _judges(env):
@@ -73,6 +68,13 @@ def _hides_success(env: gym.Env) -> bool:
         return True
     except Exception:  # an environment of somebody's may raise anything; training will tell it
         return False
+
+
+def check_goal_keys(space: spaces.Space, who: str) -> None:
+    """Raise a ValueError about `who`, with what would help, where observations hold no goals."""
+    missing = ", ".join(missing_goal_keys(space))
+    if missing:
+        raise ValueError(f"{who} has no goals: its observations lack {missing}; {SAY_GOALS}")
 
 
 def missing_goal_keys(space: spaces.Space) -> list[str]:

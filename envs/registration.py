@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import redirect_stderr
 from importlib import import_module
 from io import StringIO
+from types import MappingProxyType
+from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from .task_table import IDS, add_task
 from .tasks import Task
@@ -65,6 +69,11 @@ def import_task(env_id: str) -> str:
     elif name not in gym.registry:
         import_robotics()
     return name
+
+
+def registration_key(spec: EnvSpec, options: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    """Return what tells an environment from another of its id that was registered since."""
+    return spec.id, spec.entry_point, repr(sorted({**spec.kwargs, **options}.items(), key=str))
 
 
 def import_robotics() -> None:

@@ -22,7 +22,7 @@ from ..common.numbers import checked_whole
 from .batch import cores
 from .copies_worker import __name__ as WORKER
 from .make import make_vec
-from .registration import import_robotics, import_task
+from .registration import import_robotics, import_task, registration_key
 from .robot_face import RobotTask, needs_face
 from .robotics import is_of_robotics
 from .task_table import IDS
@@ -82,7 +82,7 @@ def with_face(env: gym.Env) -> gym.Env:
 
 def _lacks_face(spec: EnvSpec, options: dict[str, Any]) -> bool:
     """Whether an environment with goals lacks what `RobotTask` adds, looked at once a process."""
-    key = (spec.id, spec.entry_point, repr(sorted({**spec.kwargs, **options}.items(), key=str)))
+    key = registration_key(spec, options)
     if key not in _LACKING:
         try:
             probe = gym.make(spec, **options)

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..common.answers import one_each, one_number
-from .goal_envs import SAY_GOALS, SUCCESS_METHODS, missing_goal_keys
+from .goal_envs import SUCCESS_METHODS, check_goal_keys, missing_goal_keys
 from .goal_space import POSITIONS
 
 Judge = Callable[..., Any]
@@ -63,14 +63,10 @@ class RobotTask(gym.Wrapper):
         self._given = is_success
         self._judge: Judge | None = None
         self._batches = False
-        missing = missing_goal_keys(env.observation_space)
         if goal is not None:
             self.observation_space = _goal_space(env.observation_space)
-        elif missing:
-            lacking = ", ".join(missing)
-            raise ValueError(
-                f"{_name(env)} has no goals: its observations lack {lacking}; {SAY_GOALS}"
-            )
+        elif missing_goal_keys(env.observation_space):  # a name is kept once it has been asked for
+            check_goal_keys(env.observation_space, _name(env))
         if effector is not None:
             n = spaces.flatdim(cast(spaces.Dict, self.observation_space)["observation"])
             self.told_effector = n, n + 1, n + 2

@@ -16,7 +16,7 @@ from ..common.reports import Report
 from ..envs.goal_envs import SAY_GOALS, SAY_LENGTH, missing_goal_keys
 from ..envs.goal_space import followed_space
 from ..envs.physics_engine import mujoco
-from ..envs.registration import import_task
+from ..envs.registration import import_task, registration_key
 from ..envs.robot_copies import robot_maker
 from ..envs.robot_face import RobotTask, rewards_on_and_off
 from ..envs.robot_parts import body_name
@@ -86,8 +86,7 @@ def derived(env_id: str, report: Report = lambda sentence: None) -> Derived:
     name = import_task(env_id)
     if name not in gym.registry:
         raise ValueError(f"there is no environment {env_id!r}")
-    spec = gym.registry[name]
-    key = (name, spec.entry_point, repr(sorted(spec.kwargs.items(), key=str)))
+    key = registration_key(gym.registry[name])
     if key not in _LOOKED_AT:
         _LOOKED_AT[key] = _look(name, report)
     return _LOOKED_AT[key]

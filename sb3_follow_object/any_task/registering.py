@@ -88,32 +88,34 @@ def made_by_function(env_id: str) -> bool:
 
 def _free_id(title: str, version: str, given: tuple[Any, ...]) -> str:
     """Return the first id of this name that is free, or that these functions have already."""
-    for n in itertools.count(1):
-        ours = f"{NAMESPACE}/{title}{f'-{n}' if n > 1 else ''}-v{version}"
-        if _alike(_GIVEN.get(ours, given), given):
-            return ours
-    raise AssertionError("there is no end of numbers")
+    titles = itertools.chain([title], (f"{title}-{n}" for n in itertools.count(2)))
+    names = (f"{NAMESPACE}/{each}-v{version}" for each in titles)
+    return next(name for name in names if _alike(_GIVEN.get(name, given), given))
 
 
 def _alike(one: Any, other: Any) -> bool:
     """Whether two things are one, or functions that were written twice in the same words."""
+    try:
+        return _same(one, other)
+    except Exception:  # what cannot be compared, or holds itself, is another thing
+        return False
+
+
+def _same(one: Any, other: Any) -> bool:
     if one is other:
         return True
     if type(one) is not type(other):
         return False
     if isinstance(one, tuple):
-        return len(one) == len(other) and all(map(_alike, one, other))
+        return len(one) == len(other) and all(map(_same, one, other))
     if isinstance(one, partial):
-        return _alike(
+        return _same(
             (one.func, one.args, tuple(one.keywords.items())),
             (other.func, other.args, tuple(other.keywords.items())),
         )
     if isinstance(one, FunctionType):
-        return one.__globals__ is other.__globals__ and _alike(_written(one), _written(other))
-    try:
-        return bool(one == other)
-    except Exception:  # what cannot be compared is another thing
-        return False
+        return one.__globals__ is other.__globals__ and _same(_written(one), _written(other))
+    return bool(one == other)
 
 
 def _written(function: FunctionType) -> tuple[Any, ...]:

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from ..common.reports import Report
 from ..envs import IDS, make_vec, object_id, physics_id
 from ..envs.goal_envs import missing_goal_keys
-from ..envs.registration import import_task
+from ..envs.registration import import_task, registration_key
 from ..envs.robot_copies import robot_maker
 from ..envs.tasks import SUCCESS_DISTANCE
 from .context import bodies_in
@@ -151,7 +151,7 @@ def effector_seen_in(env_id: str) -> tuple[int, int, int] | None:
         ValueError: no part of the robot is told in the observation.
     """
     spec = gym.spec(import_task(env_id))
-    key = (spec.id, spec.entry_point, repr(sorted(spec.kwargs.items(), key=str)))
+    key = registration_key(spec)
     if key not in _EFFECTORS:
         _EFFECTORS[key] = _find_effector(env_id)
     return _EFFECTORS[key]

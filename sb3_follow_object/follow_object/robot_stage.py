@@ -17,7 +17,7 @@ from ..common.resuming import env_state, global_generators, set_env_state, set_g
 from ..common.seeds import stream_seed
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs import IDS
-from ..envs.goal_envs import SAY_GOALS, SAY_LENGTH, episode_steps, missing_goal_keys
+from ..envs.goal_envs import SAY_LENGTH, check_goal_keys, episode_steps
 from ..envs.robot_copies import robot_vec_env
 from ..imagination.curriculum import Curriculum
 from ..imagination.goal_predictor import GoalPredictor
@@ -47,12 +47,7 @@ class RobotStage:
         self._seed: int = settings["seed"]
         self.env = self._copies("robot")
         env_id = settings["env_id"]
-        missing = missing_goal_keys(self.env.observation_space)
-        if missing:
-            lacking = ", ".join(missing)
-            raise ValueError(
-                f"{env_id!r} has no goals: its observations lack {lacking}; {SAY_GOALS}"
-            )
+        check_goal_keys(self.env.observation_space, repr(env_id))
         horizon = episode_steps(self.env)
         if horizon is None:
             raise ValueError(f"{env_id!r} does not say how long its episodes are; {SAY_LENGTH}")

@@ -14,10 +14,11 @@ import gymnasium as gym
 import numpy as np
 
 from ..any_task.context import read_context
-from ..any_task.tasks import physics_of_task, steps_of_object
+from ..any_task.tasks import steps_of_object
 from ..common.answers import check_shape, one_number
 from ..common.copies import WholeCopies
 from ..common.providers import provider
+from ..envs import IDS, physics_id
 from ..envs.robot_copies import with_face
 from .curriculum import Curriculum
 from .goal_env import (
@@ -191,7 +192,9 @@ def _find_predictor(source: str | os.PathLike[str], env: gym.Env) -> GoalPredict
     if source == AUTO:
         found: GoalPredictor = provider("predictor", AUTO)(env.spec.id)
         return found
-    return GoalPredictor.load(source, env_id=env.spec.id, physics=physics_of_task(env.spec.id))
+    # Of a task of others it may be fitted to anybody's paths, whose physics has any name.
+    physics = physics_id(env.spec.id) if env.spec.id in IDS else None
+    return GoalPredictor.load(source, env_id=env.spec.id, physics=physics)
 
 
 def _curriculum(env: gym.Env, settings: Mapping[str, Any] | None) -> Curriculum:

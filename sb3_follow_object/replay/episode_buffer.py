@@ -17,7 +17,7 @@ from .record_buffer import Gathered, RecordReplayBuffer
 from .steps import lost_steps
 
 GRAVITY = 9.81  # m/s^2
-_GOALS_MET = 1000  # of the first episodes; they say where goals lie
+_EPISODES = 1000  # whose goals say where goals lie
 EXECUTED = "executed_action"  # in an info: what was done in place of the action given
 
 
@@ -35,7 +35,6 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
     contexts = np.zeros((0, 0, 0), dtype=np.float32)
     _far: np.ndarray
     _amiss = np.zeros(0, dtype=bool)
-    _goals_met: np.ndarray
     rng: np.random.Generator
     table: EpisodeTable
     n_added: int
@@ -106,10 +105,12 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         VecNormalize keeps raw observations, but of an episode's last one only what it has scaled
         and clipped, and SB3 cannot undo the clipping: a first lift would be a lift of millimetres.
         """
-        normalizer = unwrap_vec_normalize(self.env) if self.env is not None else None
+        ended = np.flatnonzero(done)
+        normalizer = unwrap_vec_normalize(self.env) if ended.size and self.env else None
         if normalizer is None:
             return next_obs
-        for env_idx in np.flatnonzero(done):
+        next_obs = {key: np.array(value) for key, value in next_obs.items()}
+        for env_idx in ended:
             last = infos[env_idx].get(LAST)
             seen = infos[env_idx].get("terminal_observation")
             if last is None or seen is None:
@@ -117,7 +118,6 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
             scaled = normalizer.normalize_obs(last)
             # Where another wrapper has changed it since, it is not what the policy saw.
             if all(np.array_equal(scaled[key], seen[key]) for key in scaled):
-                next_obs = {key: np.array(value) for key, value in next_obs.items()}
                 for key, value in last.items():
                     next_obs[key][env_idx] = value
         return next_obs
@@ -176,13 +176,13 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
 
     def _is_amiss(self, path: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Whether places (n, d) are where earlier episodes' goals lay, not by their own (d,)."""
-        if len(self._goals_met) < _GOALS_MET:
-            self._goals_met = np.concatenate([self._goals_met, goal[None]])
+        facts = self.table.facts[:_EPISODES]
+        start, env_idx, *_ = facts[facts[:, 2] > 0].T
+        goals = np.concatenate([self.original_goals[start, env_idx], goal[None]])
         distance = self.goal_space.distance
-        others = distance(path[:, None], self._goals_met[None]).min(axis=1)
-        amiss: np.ndarray = (others < self.scene_distance) & (
-            distance(path, goal) >= self.scene_distance
-        )
+        nearest = distance(path[:, None], goals[None]).min(axis=1)
+        own = distance(path, goal)
+        amiss: np.ndarray = (nearest < self.scene_distance) & (own >= self.scene_distance)
         return amiss
 
     def _priority(self, origin: np.ndarray, path: np.ndarray) -> float:

@@ -166,7 +166,6 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         self._far = np.zeros(self.dones.shape if self.min_goal_distance > 0.0 else (0,), dtype=bool)
         # Whether that is where other episodes' goals lie and its own does not.
         self._amiss = np.zeros(self.dones.shape if self.scene_distance > 0.0 else (0,), dtype=bool)
-        self._goals_met = np.zeros((0, *goal_shape[2:]), dtype=np.float32)
         self.table = EpisodeTable()
         self.revision = 0  # counts contents that were loaded over the earlier ones
 
@@ -227,7 +226,6 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             "table": self.table.state_dict(),
             "rng": self.rng.bit_generator.state,
             "selection": None if self.selection is None else self.selection.state_dict(),
-            **({"goals_met": self._goals_met} if self.scene_distance > 0.0 else {}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -252,8 +250,6 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         self._current_ep_start = state["current_episode_start"].copy()
         self.table.load_state_dict(state["table"])
         self.rng.bit_generator.state = state["rng"]
-        if self.scene_distance > 0.0:
-            self._goals_met = np.array(state["goals_met"], dtype=np.float32)
         if self.selection is not None:
             self.selection.load_state_dict(state["selection"])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,11 @@ from small_models import weights
 from tiny_runs import SMALL_NET, TINY, config, quiet
 
 from sb3_follow_object.any_task import derived as looking
-from sb3_follow_object.any_task.tasks import kept_as, physics_of_task
+from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.common.cache import CACHE_VARIABLE
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.follow_object.saved_folder import read
+from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.imagination.predictor_files import FACTS_FILE
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
 from sb3_follow_object.object_stage import stage as stages
@@ -220,14 +220,13 @@ def test_sldr_is_refused_before_the_object_learns() -> None:
         run.check()
 
 
-def test_a_folders_predictor_must_be_of_the_tasks_physics(tmp_path: Path) -> None:
-    FollowObject(ARM, report=quiet, **TINY).object_stage.learn_predictor().save(tmp_path / "phi")
+def test_a_folders_predictor_may_be_of_paths_of_ones_own(tmp_path: Path) -> None:
+    path = np.linspace([0.3, -0.2, 0.025], [0.4, 0.2, 0.025], 51)
+    paths = np.tile(path, (20, 1, 1))
+    predictor = GoalPredictor.fit(paths, paths[:, -1], env_id=ARM, physics="a line", epochs=1)
+    predictor.save(tmp_path / "phi")
     env = ImaginedGoalWrapper(gym.make(ARM), tmp_path / "phi", {"p": 0.0})
-    assert env.predictor.physics == physics_of_task(ARM)
-    facts = json.loads((tmp_path / "phi" / FACTS_FILE).read_text())
-    (tmp_path / "phi" / FACTS_FILE).write_text(json.dumps({**facts, "physics": "another"}))
-    with pytest.raises(ValueError, match="physics"):
-        _ = ImaginedGoalWrapper(gym.make(ARM), tmp_path / "phi", {"p": 0.0}).predictor
+    assert env.predictor.physics == "a line"
 
 
 def test_a_wall_that_stands_elsewhere_in_each_episode_is_seen_in_all_stages(tmp_path: Path) -> None:

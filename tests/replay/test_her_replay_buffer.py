@@ -189,7 +189,6 @@ def test_hindsight_goals_where_other_goals_lie_are_left_out(imagines: bool) -> N
         env = ImaginedGoalVecEnv(env, StraightPredictor(), curriculum)
     buffer = make_buffer(env, scene_distance=0.04, n_sampled_goal=10**9)
     fill([buffer], env, 20 * HORIZON)
-    np.testing.assert_allclose(np.unique(buffer._goals_met, axis=0), np.unique(goals, axis=0))
 
     def relabelled_to_the_second() -> np.ndarray:
         """How many of each goal's transitions are relabelled with where the second goal is."""
