@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from ..common.mirrors import Mirror
 from .batch import MAX_DISPLACEMENT, BatchedSimulation, euler_angles, rotate
 from .faces import BatchVecEnv, RewardType, SingleEnv
 from .physics_engine import mujoco
 from .scene import FINGER_JOINTS, GRIP_SITE, fetch_scene
+from .symmetry import fetch_mirrors
 from .task_table import find_task, task_of
 from .tasks import Task
 
@@ -124,6 +126,11 @@ class FetchEnv(SingleEnv):
         scene = fetch_scene(find_task(task), collision)
         self._set_up(scene, reward_type, render_mode, show_regions)
 
+    @property
+    def mirrors(self) -> tuple[Mirror, ...]:
+        """Planes over which the task is symmetric."""
+        return fetch_mirrors(self.simulation.scene.task)
+
 
 class FetchVecEnv(BatchVecEnv):
     """N copies of a robot task as one SB3 VecEnv: native threads, vectorised observations.
@@ -166,3 +173,8 @@ class FetchVecEnv(BatchVecEnv):
             show_regions=show_regions,
             max_episode_steps=max_episode_steps,
         )
+
+    @property
+    def mirrors(self) -> tuple[Mirror, ...]:
+        """Planes over which the task is symmetric."""
+        return fetch_mirrors(self.simulation.scene.task)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import asdict
 from itertools import pairwise
 
 import torch as th
@@ -13,7 +14,8 @@ from torch import nn
 from ..common.array_trees import load_tree, save_tree
 from ..common.reports import reason
 from ..common.torch_helpers import usual_defaults
-from .policies import NormalizedGoalExtractor
+from .folding import folding_of
+from .policies import FoldedActor, NormalizedGoalExtractor
 
 # Activation functions that a policy's file may name.
 _ACTIVATIONS: dict[str, type[nn.Module]] = {
@@ -34,6 +36,7 @@ def save_actor(path: str | os.PathLike[str], actor: Actor, env_id: str) -> None:
     """
     extractor = actor.features_extractor
     assert isinstance(extractor, NormalizedGoalExtractor)
+    folding = extractor.folding
     activation = actor.activation_fn.__name__
     if _ACTIVATIONS.get(activation) is not actor.activation_fn:
         raise ValueError(
@@ -44,6 +47,7 @@ def save_actor(path: str | os.PathLike[str], actor: Actor, env_id: str) -> None:
         "net_arch": actor.net_arch,
         "activation": activation,
         "clip": extractor.clip,
+        "mirrors": [] if folding is None else [asdict(each) for each in folding.mirrors],
         "actor": actor.state_dict(),
     }
     save_tree(path, saved)
@@ -62,16 +66,17 @@ def load_actor(
     """
     saved = load_tree(path)
     try:
-        # The first files had neither.
+        # The first files had none of these.
         clip, activation = float(saved.get("clip", 5.0)), saved.get("activation", "ReLU")
         if not clip > 0.0:
             raise ValueError(f"its inputs are clipped at {clip}")
+        folding = folding_of(saved.get("mirrors", []), observation_space, action_space)
         with usual_defaults():
-            extractor = NormalizedGoalExtractor(observation_space, clip)
+            extractor = NormalizedGoalExtractor(observation_space, clip, folding)
         widths = [extractor.features_dim, *saved["net_arch"], *action_space.shape]
         _check_layers(saved["actor"], widths)  # before anything of their size is allocated
         with usual_defaults():
-            actor = Actor(
+            actor = FoldedActor(
                 observation_space,
                 action_space,
                 saved["net_arch"],

@@ -28,6 +28,7 @@ from ..settings.learning import AlgorithmSettings
 from .auxiliary import Transitions, make_auxiliary, resolve_auxiliary
 from .env_checks import check_goals, check_rewards, check_wrappers, horizon_of
 from .exploration import explored
+from .folding import resolved_mirrors
 from .input_moments import InputMoments
 from .kept_state import KeptDDPG
 from .policies import HerPolicy
@@ -88,7 +89,8 @@ class HerDDPG(KeptDDPG):
             and reward there, so that no batch is copied. None: on CUDA, where the buffer's settings
             and the environment's reward allow it (`DeviceReplay`). True: also on the CPU, and an
             error where they do not.
-        policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them.
+        policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them; `mirrors` may be "auto", what
+            the environment's attribute `mirrors` names.
 
     The other arguments are DDPG's.
 
@@ -215,6 +217,9 @@ class HerDDPG(KeptDDPG):
         self._check_env(self.env)
         if self.auxiliary is not None:
             self.auxiliary = resolve_auxiliary(self.auxiliary, self.env)
+        if self.policy_kwargs.get("mirrors") is not None:
+            given = self.policy_kwargs["mirrors"]
+            self.policy_kwargs["mirrors"] = resolved_mirrors(given, self.env)
         super()._setup_model()
         with_steps = isinstance(self.replay_buffer, FollowObjectReplayBuffer | None)
         if self.hindsight_bound and not with_steps:
@@ -288,7 +293,7 @@ class HerDDPG(KeptDDPG):
     def _update_moments(self) -> None:
         """Standardise inputs from now on by all that has been stored."""
         assert self.replay_buffer is not None
-        if self.moments.take(self.replay_buffer):
+        if self.moments.take(self.replay_buffer, self.policy.folding):
             self.policy.set_moments(
                 th.as_tensor(self.moments.mean, dtype=th.float32),
                 th.as_tensor(self.moments.std, dtype=th.float32),
@@ -318,7 +323,7 @@ class HerDDPG(KeptDDPG):
     def _train(self, gradient_steps: int, batch_size: int) -> None:
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
-        auxiliary = self.auxiliary_critic
+        auxiliary, folding = self.auxiliary_critic, self.policy.folding
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         self._update_learning_rate(optimizers + ([auxiliary.optimizer] if auxiliary else []))
         self._update_moments()
@@ -330,9 +335,13 @@ class HerDDPG(KeptDDPG):
                 check_rewards(data.rewards, self.target_clip == "auto", self.hindsight_bound)
             bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
             # All networks share their input moments, so features are computed once.
+            actions = data.actions
+            if folding is not None:
+                goals = data.observations["desired_goal"].float().flatten(1)
+                actions = folding.actions(actions, goals)
             chunk = Transitions(
                 data.observations,
-                data.actions,
+                actions,
                 data.next_observations,
                 self.actor.features_extractor(data.observations),
                 self.actor.features_extractor(data.next_observations),

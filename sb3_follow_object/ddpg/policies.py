@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import torch as th
@@ -11,11 +13,13 @@ from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.td3.policies import TD3Policy
+from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
+from ..common.mirrors import Mirror, as_mirror
 from ..common.torch_helpers import WholeModule, one_thread_after_forks, usual_defaults
 from ..settings.learning import PolicySettings
+from .folding import Folding, folding_of
 from .layer_norm import LayerNorm
 
 one_thread_after_forks()
@@ -30,23 +34,46 @@ class NormalizedGoalExtractor(BaseFeaturesExtractor):
     Args:
         observation_space: Dict with "observation" and "desired_goal".
         clip: bound on each standardised entry, in standard deviations.
+        folding: brings both to one side of planes of symmetry before.
     """
 
     mean: th.Tensor
     std: th.Tensor
 
-    def __init__(self, observation_space: spaces.Dict, clip: float = PolicySettings.features_clip):
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        clip: float = PolicySettings.features_clip,
+        folding: Folding | None = None,
+    ):
         self.keys = ("observation", "desired_goal")
         dim = sum(get_flattened_obs_dim(observation_space[key]) for key in self.keys)
         super().__init__(observation_space, dim)
         self.clip = clip
+        self.folding = folding
         self.register_buffer("mean", th.zeros(dim))
         self.register_buffer("std", th.ones(dim))
 
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
         """Map a batch of observations to features (n, features_dim)."""
-        inputs = th.cat([observations[key].float().flatten(1) for key in self.keys], dim=-1)
+        parts = tuple(observations[key].float().flatten(1) for key in self.keys)
+        if self.folding is not None:
+            parts = self.folding.states(*parts)
+        inputs = th.cat(parts, dim=-1)
         return ((inputs - self.mean) / self.std).clamp_(-self.clip, self.clip)
+
+
+class FoldedActor(Actor):
+    """SB3's actor, whose actions in states that were mirrored are mirrored back."""
+
+    def forward(self, obs: PyTorchObs) -> th.Tensor:
+        """Map a batch of observations to actions (n, action_dim)."""
+        actions = super().forward(obs)  # type: ignore[arg-type]
+        folding = self.features_extractor.folding
+        if folding is None:
+            return actions
+        assert isinstance(folding, Folding) and isinstance(obs, dict)
+        return folding.actions(actions, obs["desired_goal"].float().flatten(1))
 
 
 class LayerNormCritic(ContinuousCritic):
@@ -84,6 +111,8 @@ class HerPolicy(WholeModule, TD3Policy):
     Args:
         critic_layer_norm: LayerNorm after each hidden layer of the critics. Beyond the paper.
         features_clip: see `NormalizedGoalExtractor`.
+        mirrors: planes over which the environment is symmetric, as `Mirror` or its fields: the
+            networks see every state on one side of them. Beyond the paper.
 
     The other arguments are TD3Policy's.
     """
@@ -96,6 +125,7 @@ class HerPolicy(WholeModule, TD3Policy):
         net_arch: list[int] | dict[str, list[int]] | None = None,
         critic_layer_norm: bool = PolicySettings.critic_layer_norm,
         features_clip: float = PolicySettings.features_clip,
+        mirrors: Sequence[Mirror | Mapping[str, Any]] | None = None,
         **kwargs: Any,
     ):
         if "features_extractor_class" in kwargs:
@@ -104,6 +134,8 @@ class HerPolicy(WholeModule, TD3Policy):
             )
         self.critic_layer_norm = critic_layer_norm
         self.features_clip = features_clip
+        self.mirrors = [asdict(as_mirror(each)) for each in mirrors or ()]
+        folding = folding_of(self.mirrors, observation_space, action_space)
         with usual_defaults():
             super().__init__(
                 observation_space,
@@ -111,7 +143,7 @@ class HerPolicy(WholeModule, TD3Policy):
                 lr_schedule,
                 net_arch=[256, 256, 256] if net_arch is None else net_arch,
                 features_extractor_class=NormalizedGoalExtractor,
-                features_extractor_kwargs={"clip": features_clip},
+                features_extractor_kwargs={"clip": features_clip, "folding": folding},
                 **with_fused_adam(kwargs),
             )
 
@@ -120,7 +152,11 @@ class HerPolicy(WholeModule, TD3Policy):
         arguments = super()._get_constructor_parameters()
         for brought in ("features_extractor_class", "features_extractor_kwargs"):
             del arguments[brought]
-        own = {"critic_layer_norm": self.critic_layer_norm, "features_clip": self.features_clip}
+        own = {
+            "critic_layer_norm": self.critic_layer_norm,
+            "features_clip": self.features_clip,
+            "mirrors": self.mirrors,
+        }
         return {**arguments, **own}
 
     def _build(self, lr_schedule: Schedule) -> None:
@@ -142,6 +178,18 @@ class HerPolicy(WholeModule, TD3Policy):
             th._foreach_copy_(average, live)
         else:
             th._foreach_lerp_(average, live, 1.0 - decay)
+
+    @property
+    def folding(self) -> Folding | None:
+        """What brings states and actions to one side of planes of symmetry, if there are any."""
+        extractor = self.actor.features_extractor
+        assert isinstance(extractor, NormalizedGoalExtractor)
+        return extractor.folding
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """Build the actor (or its target)."""
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return FoldedActor(**kwargs).to(self.device)
 
     def make_critic(
         self, features_extractor: BaseFeaturesExtractor | None = None

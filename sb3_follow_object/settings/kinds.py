@@ -5,10 +5,12 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
+from ..common.mirrors import as_mirror
 from ..common.numbers import as_number, as_whole
 from .fields import Said
 
@@ -98,6 +100,14 @@ def _standoff(value: Any) -> Any:
     return metres
 
 
+def _mirrors(value: Any) -> Any:
+    if isinstance(value, str) and value == "auto":
+        return "auto"
+    if not isinstance(value, list | tuple):
+        raise ValueError
+    return [asdict(as_mirror(mirror)) for mirror in value]
+
+
 def _policy(value: Any) -> Any:
     if isinstance(value, type) or value == "MultiInputPolicy":
         return value
@@ -127,6 +137,11 @@ Rate = Annotated[Any, BeforeValidator(_rate), Said("a number in (0, inf)")]
 Strategy = Annotated[Any, BeforeValidator(_strategy), Said("'future', 'final' or 'episode'")]
 Indices = Annotated[Any, BeforeValidator(_indices), Said("three whole numbers of at least 0")]
 Standoff = Annotated[Any, BeforeValidator(_standoff), Said('"auto" or a number of at least 0')]
+Mirrors = Annotated[
+    Any,
+    BeforeValidator(_mirrors),
+    Said('"auto" or a list of mirrors, each with axis, at, positions, signs, swaps and actions'),
+]
 Policy = Annotated[Any, BeforeValidator(_policy), Said("MultiInputPolicy")]
 PythonClass = Annotated[type, Said("a class, which only Python code can give")]
 Reward = Annotated[Any, Said("rnd, sldr or a subclass of `AuxiliaryReward`")]

@@ -15,6 +15,7 @@ from .kinds import (
     Device,
     GradientSteps,
     Hidden,
+    Mirrors,
     NetArch,
     Networks,
     Policy,
@@ -175,6 +176,13 @@ class PolicySettings(Group):
     features_clip: Annotated[
         Number, setting("bound on the inputs", unit="standard deviations", gt=0)
     ] = 5.0
+    mirrors: Annotated[
+        Mirrors | None,
+        setting(
+            "planes over which the environment is symmetric; the networks see one side",
+            none="none",
+        ),
+    ] = None
     n_critics: Annotated[
         Whole, setting("critics, whose lowest value counts", ge=1, le=CRITICS_LIMIT)
     ] = 1
