@@ -121,8 +121,8 @@ class ObjectNetworks(WholeModule):
             between_updates: called after each; may raise to stop.
 
         Raises:
-            ValueError: an argument is outside its range, or the policy has other activations than
-                ReLU.
+            ValueError: an argument is outside its range, or the policy has mirrors, or other
+                activations than ReLU.
         """
         settings = InverseSettings(
             hidden=hidden, learning_rate=learning_rate, batch_size=batch_size, updates=updates
@@ -134,6 +134,11 @@ class ObjectNetworks(WholeModule):
             raise ValueError(
                 "SLDR's reward reads an object policy with ReLU, not "
                 f"{policy.activation_fn.__name__}; leave activation_fn out of object_algorithm"
+            )
+        if policy.mirrors:
+            raise ValueError(
+                "SLDR's reward reads an object policy without mirrors; leave them out of "
+                "object_algorithm"
             )
         pi, qf = get_actor_critic_arch(policy.net_arch)
         extractor = model.actor.features_extractor
