@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .callbacks.curriculum_callback import CurriculumCallback as CurriculumCallback
     from .callbacks.eval_callback import OriginalGoalEvalCallback as OriginalGoalEvalCallback
     from .callbacks.reach_callback import ReachCallback as ReachCallback
+    from .common.mirrors import Mirror as Mirror
     from .ddpg.actor_files import load_actor as load_actor
     from .ddpg.actor_files import save_actor as save_actor
     from .ddpg.auxiliary import AuxiliaryReward as AuxiliaryReward
@@ -58,6 +59,7 @@ _HOME = {
     "ImaginedGoalVecEnv": "imagination.vec_env",
     "ImaginedGoalWrapper": "imagination.wrapper",
     "LayerNormReLU": "ddpg.layer_norm",
+    "Mirror": "common.mirrors",
     "ObjectNetworks": "object_stage.networks",
     "OriginalGoalEvalCallback": "callbacks.eval_callback",
     "ReachCallback": "callbacks.reach_callback",

@@ -5,16 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import arm_and_wall
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 
-from sb3_follow_object import HerDDPG
+from sb3_follow_object import HerDDPG, HerPolicy
 from sb3_follow_object.common.mirrors import Mirror
 from sb3_follow_object.ddpg.actor_files import load_actor, save_actor
 from sb3_follow_object.ddpg.folding import Folding, resolved_mirrors
 from sb3_follow_object.envs import TASKS, Box, FetchVecEnv, Region, Task
+from sb3_follow_object.envs.robot_copies import robot_vec_env
 from sb3_follow_object.envs.symmetry import fetch_mirrors
 
 X = Mirror(axis=0, at=1.0, positions=(0,), signs=(3,), swaps=((1, 2),), actions=(0,))
@@ -157,3 +159,35 @@ def test_auto_finds_none_where_the_environment_names_none() -> None:
     assert told["signs"] == (2,)
     env = gym.make("FollowObject/PushMiddleGap-v0")
     assert [mirror.axis for mirror in env.get_wrapper_attr("mirrors")] == [0]
+
+
+class MirroredArm(arm_and_wall.ArmAndWall):
+    """The tutorial's arm, with planes that somebody might name."""
+
+    mirrors = ({"axis": 1, "at": 0.0, "positions": [1, 4], "actions": [0]},)
+
+
+gym.register("MirroredArm-v0", MirroredArm, max_episode_steps=5)
+
+
+@pytest.mark.parametrize("n_threads", [1, 2])
+def test_others_environments_name_their_planes(n_threads: int) -> None:
+    env = robot_vec_env("MirroredArm-v0", 2, n_threads)
+    model = _model(env, mirrors="auto", net_arch=[8])
+    assert model.policy.folding is not None
+    assert [mirror.axis for mirror in model.policy.folding.mirrors] == [1]
+    env.close()
+
+
+def test_mirrors_for_other_goals_are_refused() -> None:
+    box = gym.spaces.Box(-1.0, 1.0, (2,))
+    spaces = gym.spaces.Dict({"observation": box, "achieved_goal": box, "desired_goal": box})
+    with pytest.raises(ValueError, match="positions"):
+        HerPolicy(spaces, box, lambda _: 1e-3, mirrors=[{"axis": 0, "at": 0.0}])
+
+
+@pytest.mark.parametrize("given", ["left", [1], [{"at": 0.0}], [{"axis": 0, "at": 0.0, "x": 1}]])
+def test_what_is_no_list_of_mirrors_is_refused(given: Any) -> None:
+    env = FetchVecEnv("FollowObject/PnPSimpleV1-v0", 1, seed=0)
+    with pytest.raises(ValueError, match="mirrors"):
+        _model(env, mirrors=given)
