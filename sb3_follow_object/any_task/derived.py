@@ -20,6 +20,7 @@ from ..envs.registration import import_task, registration_key
 from ..envs.robot_copies import robot_maker
 from ..envs.robot_face import RobotTask, rewards_on_and_off
 from ..envs.robot_parts import body_name
+from ..envs.robotics import check_robotics
 from .context import context_of
 from .finding import Candidate, Effector, Observed, candidates, find_effector, find_object, observe
 from .physics_access import is_simulated, physics_of
@@ -104,6 +105,7 @@ def object_horizon(horizon: int) -> int:
 
 
 def _look(env_id: str, report: Report) -> Derived:
+    check_robotics(env_id)
     try:
         env = robot_maker(env_id)()
     except ValueError:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from sb3_follow_object import FollowObject
+from sb3_follow_object.any_task.derived import derived
 from sb3_follow_object.envs import make_vec, robotics
 from sb3_follow_object.envs.goal_envs import check_task
 
@@ -17,11 +20,16 @@ def installed(monkeypatch: pytest.MonkeyPatch, **releases: str) -> None:
     monkeypatch.setattr(robotics, "version", version)
 
 
-@pytest.mark.parametrize("ask", [check_task, lambda env_id: make_vec(env_id, 1)])
+def follow(env_id: str) -> Any:
+    return FollowObject(env_id).learn(1)
+
+
+@pytest.mark.parametrize("ask", [check_task, lambda env_id: make_vec(env_id, 1), derived, follow])
 def test_its_environments_are_refused_from_mujoco_3_12_on(
-    ask: Any, monkeypatch: pytest.MonkeyPatch
+    ask: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     installed(monkeypatch, mujoco="4.0.0", robotics="1.4.2")
+    monkeypatch.setenv("SB3_FOLLOW_OBJECT_CACHE", str(tmp_path))
     with pytest.raises(ValueError) as error:
         ask("FetchPush-v4")
     assert str(error.value) == (
