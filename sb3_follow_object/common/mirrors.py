@@ -61,6 +61,17 @@ class Mirror:
         told = [*self.positions, *self.signs, *(entry for pair in self.swaps for entry in pair)]
         return max(told, default=-1) + 1, max(self.actions, default=-1) + 1
 
+    def plain(self) -> dict[str, Any]:
+        """Return the fields as JSON and YAML have them, which `as_mirror` takes."""
+        return {
+            "axis": self.axis,
+            "at": self.at,
+            "positions": [*self.positions],
+            "signs": [*self.signs],
+            "swaps": [[*pair] for pair in self.swaps],
+            "actions": [*self.actions],
+        }
+
 
 def as_mirror(given: Mirror | Mapping[str, Any]) -> Mirror:
     """Return a mirror from its fields by their names, as YAML gives them.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict
 from itertools import pairwise
 
 import torch as th
@@ -47,7 +46,7 @@ def save_actor(path: str | os.PathLike[str], actor: Actor, env_id: str) -> None:
         "net_arch": actor.net_arch,
         "activation": activation,
         "clip": extractor.clip,
-        "mirrors": [] if folding is None else [asdict(each) for each in folding.mirrors],
+        "mirrors": [] if folding is None else [each.plain() for each in folding.mirrors],
         "actor": actor.state_dict(),
     }
     save_tree(path, saved)

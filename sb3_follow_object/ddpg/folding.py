@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import torch as th
@@ -130,4 +129,4 @@ def resolved_mirrors(given: Any, env: VecEnv | None) -> list[dict[str, Any]]:
     if given == "auto":
         has = env is not None and env.has_attr("mirrors")
         given = env.get_attr("mirrors", indices=[0])[0] if has and env is not None else ()
-    return [asdict(as_mirror(mirror)) for mirror in given or ()]
+    return [as_mirror(mirror).plain() for mirror in given or ()]

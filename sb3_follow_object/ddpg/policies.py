@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import torch as th
@@ -134,7 +133,7 @@ class HerPolicy(WholeModule, TD3Policy):
             )
         self.critic_layer_norm = critic_layer_norm
         self.features_clip = features_clip
-        self.mirrors = [asdict(as_mirror(each)) for each in mirrors or ()]
+        self.mirrors = [as_mirror(each).plain() for each in mirrors or ()]
         folding = folding_of(self.mirrors, observation_space, action_space)
         with usual_defaults():
             super().__init__(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator
@@ -105,7 +104,7 @@ def _mirrors(value: Any) -> Any:
         return "auto"
     if not isinstance(value, list | tuple):
         raise ValueError
-    return [asdict(as_mirror(mirror)) for mirror in value]
+    return [as_mirror(mirror).plain() for mirror in value]
 
 
 def _policy(value: Any) -> Any:

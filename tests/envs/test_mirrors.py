@@ -11,6 +11,7 @@ from sb3_follow_object.ddpg.folding import Folding
 from sb3_follow_object.envs import TASKS, FetchEnv
 from sb3_follow_object.envs.physics_engine import mujoco
 from sb3_follow_object.envs.symmetry import fetch_mirrors
+from sb3_follow_object.settings.presets import run_config
 
 PAIRS = [(name, mirror) for name, task in TASKS.items() for mirror in fetch_mirrors(task)]
 N_STEPS = 3
@@ -57,3 +58,15 @@ def test_mirrored_actions_have_mirrored_outcomes(name: str, mirror: Mirror) -> N
     assert np.median(moved) > 0.02
     gripper, cubes = np.median(off, axis=0)[:, :3], np.median(off, axis=0)[:, 3:6]
     assert gripper.max() < 0.001 and cubes.max() < 0.003
+
+
+@pytest.mark.parametrize("method", ["fo", "her", "rher"])
+@pytest.mark.parametrize("env_id", ["FetchPush-v4", "FetchPickAndPlace-v4"])
+def test_presets_have_the_same_mirrors_for_the_robot_that_names_none(
+    env_id: str, method: str
+) -> None:
+    algorithm = run_config(env_id, method=method).settings["algorithm"]
+    own = [mirror.plain() for mirror in FetchEnv("PnPSimpleV1").mirrors]
+    assert algorithm["policy_kwargs"]["mirrors"] == own
+    pushed = "uniform" if env_id == "FetchPush-v4" else "energy"
+    assert algorithm["replay_buffer_kwargs"]["moved_priority"] == pushed
