@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_follow_object import HerDDPG, HerPolicy
+from sb3_follow_object import HerDDPG, HerPolicy, export_onnx
 from sb3_follow_object.common.mirrors import Mirror
 from sb3_follow_object.ddpg.actor_files import load_actor, save_actor
 from sb3_follow_object.ddpg.folding import Folding, resolved_mirrors
@@ -111,6 +111,7 @@ def test_the_policy_acts_in_a_mirrored_state_as_in_a_mirror(tmp_path: Path) -> N
     save_actor(tmp_path / "policy.safetensors", model.policy.actor, "some-v0")
     actor, _ = load_actor(tmp_path / "policy.safetensors", env.observation_space, env.action_space)
     np.testing.assert_array_equal(actor.predict(obs, deterministic=True)[0], played)
+    assert export_onnx(model, tmp_path / "policy.onnx") < 1e-5  # compares them by itself
     model.save(tmp_path / "model")
     loaded = HerDDPG.load(tmp_path / "model")
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], played)
