@@ -36,6 +36,7 @@ import sb3_follow_object
 from sb3_follow_object.common.files import atomic_write
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import make_vec
+from sb3_follow_object.envs.robot_copies import robot_vec_env
 from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
 from sb3_follow_object.settings.presets import preset_file, read_yaml
 
@@ -46,6 +47,7 @@ ROBOT, OBJECT, ORIGINAL = (
     "FollowObject/PnPSimpleV1Object-v0",
     "FetchPickAndPlace-v4",
 )
+OF_OTHERS = 16  # copies of an environment that is not this package's
 HIDDEN = [256, 256, 256]
 PACKAGES = ("sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics", "mujoco")
 PACKAGES += ("torch", "numpy", "envpool")
@@ -105,6 +107,16 @@ def simulation() -> Iterator[Figure]:
     }
     ours = vec_env_rate(make_vec(ROBOT, 32, CORES), n_steps)
     yield "robot simulation", "env steps/s", ours, baselines
+    subproc.close()
+    copies = robot_vec_env(ORIGINAL, OF_OTHERS, CORES)
+    subproc = SubprocVecEnv([_make_original] * OF_OTHERS)
+    yield (
+        f"{OF_OTHERS} copies of {ORIGINAL} itself",
+        "env steps/s",
+        vec_env_rate(copies, n_steps),
+        {"SubprocVecEnv": vec_env_rate(subproc, n_steps)},
+    )
+    copies.close()
     subproc.close()
     yield (
         "object simulation",
