@@ -98,7 +98,18 @@ class FetchSimulation(BatchedSimulation):
         return np.concatenate(parts, axis=1), read["object_pos"].copy()
 
 
-class FetchEnv(SingleEnv):
+class _Mirrored:
+    """What both faces of a robot task say of its symmetry."""
+
+    simulation: BatchedSimulation
+
+    @property
+    def mirrors(self) -> tuple[Mirror, ...]:
+        """Planes over which the task is symmetric."""
+        return fetch_mirrors(self.simulation.scene.task)
+
+
+class FetchEnv(_Mirrored, SingleEnv):
     """One robot task as a gymnasium.Env with Dict observations (paper, section 5.1).
 
     Args:
@@ -126,13 +137,8 @@ class FetchEnv(SingleEnv):
         scene = fetch_scene(find_task(task), collision)
         self._set_up(scene, reward_type, render_mode, show_regions)
 
-    @property
-    def mirrors(self) -> tuple[Mirror, ...]:
-        """Planes over which the task is symmetric."""
-        return fetch_mirrors(self.simulation.scene.task)
 
-
-class FetchVecEnv(BatchVecEnv):
+class FetchVecEnv(_Mirrored, BatchVecEnv):
     """N copies of a robot task as one SB3 VecEnv: native threads, vectorised observations.
 
     Args:
@@ -173,8 +179,3 @@ class FetchVecEnv(BatchVecEnv):
             show_regions=show_regions,
             max_episode_steps=max_episode_steps,
         )
-
-    @property
-    def mirrors(self) -> tuple[Mirror, ...]:
-        """Planes over which the task is symmetric."""
-        return fetch_mirrors(self.simulation.scene.task)

@@ -21,13 +21,16 @@ def fetch_mirrors(task: Task) -> tuple[Mirror, ...]:
     return tuple(
         mirror
         for mirror in _FETCH
-        if all(_mirrored(boxes, mirror.axis) == set(boxes) for boxes in (task.obstacles, task.tube))
+        if all(_symmetric(boxes, mirror.axis) for boxes in (task.obstacles, task.tube))
     )
 
 
-def _mirrored(boxes: tuple[Box, ...], axis: int) -> set[Box]:
-    def centre(box: Box) -> tuple[float, float, float]:
-        x, y, z = (-value if i == axis else value for i, value in enumerate(box.centre))
-        return x, y, z
+def _symmetric(boxes: tuple[Box, ...], axis: int) -> bool:
+    def placed(box: Box, sign: float) -> Box:
+        x, y, z = (
+            round(sign * value if i == axis else value, 6) + 0.0  # no -0.0
+            for i, value in enumerate(box.centre)
+        )
+        return replace(box, centre=(x, y, z))
 
-    return {replace(box, centre=centre(box)) for box in boxes}
+    return {placed(box, -1.0) for box in boxes} == {placed(box, 1.0) for box in boxes}

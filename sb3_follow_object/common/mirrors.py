@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from .numbers import checked_number, checked_whole
+
+_FARTHEST = 1e6  # metres that a plane may be away
 
 
 @dataclass(frozen=True)
@@ -21,7 +25,7 @@ class Mirror:
         positions: entries of an observation that are this coordinate of a position.
         signs: entries that change their sign: this coordinate of a velocity or of a difference, the
             other two of an angular velocity or of Euler angles.
-        swaps: pairs of entries that change places, as those of two fingers do.
+        swaps: pairs of entries that change places before that, as those of two fingers do.
         actions: entries of an action that change their sign.
 
     Raises:
@@ -37,23 +41,20 @@ class Mirror:
     actions: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        pairs = [tuple(pair) for pair in self.swaps]
-        if any(len(pair) != 2 for pair in pairs):
-            raise ValueError(f"a mirror's swaps are pairs of entries, not {self.swaps}")
         checked = {
             "axis": checked_whole("a mirror's axis", self.axis, 0, 2),
-            "at": checked_number("a mirror's at", self.at, -1e6, 1e6),
-            "positions": _entries(self.positions),
-            "signs": _entries(self.signs),
-            "swaps": tuple(_entries(pair) for pair in pairs),
-            "actions": _entries(self.actions),
+            "at": checked_number("a mirror's at", self.at, -_FARTHEST, _FARTHEST),
+            "positions": _entries("positions", self.positions),
+            "signs": _entries("signs", self.signs),
+            "swaps": tuple(_pair(pair) for pair in _listed("swaps", self.swaps)),
+            "actions": _entries("actions", self.actions),
         }
         for name, value in checked.items():
             object.__setattr__(self, name, value)
-        told = [*self.positions, *self.signs, *(entry for pair in self.swaps for entry in pair)]
-        for entries in (told, self.actions):
-            if len(set(entries)) < len(entries):
-                raise ValueError(f"a mirror tells an entry twice: {sorted(entries)}")
+        swapped = [entry for pair in self.swaps for entry in pair]
+        for told in ([*self.positions, *self.signs], swapped, self.actions):
+            if len(set(told)) < len(told):
+                raise ValueError(f"a mirror tells an entry twice: {sorted(told)}")
 
     @property
     def needs(self) -> tuple[int, int]:
@@ -61,8 +62,37 @@ class Mirror:
         told = [*self.positions, *self.signs, *(entry for pair in self.swaps for entry in pair)]
         return max(told, default=-1) + 1, max(self.actions, default=-1) + 1
 
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        """Return the mirror image of observations (..., d)."""
+        order, sign, shift = self.table(observation.shape[-1])
+        return observation[..., order] * sign + shift
+
+    def goal(self, goal: np.ndarray) -> np.ndarray:
+        """Return the mirror image of goals (..., 3)."""
+        across = np.arange(goal.shape[-1]) == self.axis
+        return np.where(across, 2.0 * self.at - goal, goal)
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        """Return the mirror image of actions (..., a)."""
+        return action * self.action_sign(action.shape[-1])
+
+    def table(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return order, sign, shift (size,): entry i becomes sign[i] * x[order[i]] + shift[i]."""
+        order, sign, shift = np.arange(size), np.ones(size), np.zeros(size)
+        for first, second in self.swaps:
+            order[[first, second]] = second, first
+        sign[[*self.positions, *self.signs]] = -1.0
+        shift[[*self.positions]] = 2.0 * self.at
+        return order, sign, shift
+
+    def action_sign(self, size: int) -> np.ndarray:
+        """Return what each entry of an action is multiplied by, (size,)."""
+        sign = np.ones(size)
+        sign[[*self.actions]] = -1.0
+        return sign
+
     def plain(self) -> dict[str, Any]:
-        """Return the fields as JSON and YAML have them, which `as_mirror` takes."""
+        """Return the fields as JSON and YAML have them, which `as_mirrors` takes."""
         return {
             "axis": self.axis,
             "at": self.at,
@@ -73,21 +103,46 @@ class Mirror:
         }
 
 
-def as_mirror(given: Mirror | Mapping[str, Any]) -> Mirror:
-    """Return a mirror from its fields by their names, as YAML gives them.
+def as_mirrors(given: Any) -> list[Mirror]:
+    """Return mirrors from a list of them or of their fields by name, as YAML gives them.
 
     Raises:
-        ValueError: a field is unknown, missing or wrong.
+        ValueError: it is no list, or a field is unknown, missing or wrong.
     """
+    if not isinstance(given, list | tuple):
+        raise ValueError(
+            f"mirrors are a list of Mirror or of mappings with axis and at, not {given!r}"
+        )
+    return [_as_mirror(each) for each in given]
+
+
+def _as_mirror(given: Any) -> Mirror:
     if isinstance(given, Mirror):
         return given
-    if not isinstance(given, Mapping):
+    if not isinstance(given, Mapping) or not {"axis", "at"} <= set(given):
         raise ValueError(f"a mirror is a mapping with axis and at, not {given!r}")
-    try:
-        return Mirror(**given)
-    except TypeError as error:
-        raise ValueError(f"a mirror is a mapping with axis and at, not {dict(given)}") from error
+    unknown = sorted(map(str, set(given) - set(Mirror.__dataclass_fields__)))
+    if unknown:
+        raise ValueError(
+            f"a mirror has no {unknown[0]!r}; it has {', '.join(Mirror.__dataclass_fields__)}"
+        )
+    return Mirror(**given)
 
 
-def _entries(values: Any) -> tuple[int, ...]:
-    return tuple(checked_whole("an entry of a mirror", value, 0) for value in values)
+def _listed(name: str, values: Any) -> Iterable[Any]:
+    if not isinstance(values, list | tuple):
+        raise ValueError(f"a mirror's {name} are a list, not {values!r}")
+    return values
+
+
+def _entries(name: str, values: Any) -> tuple[int, ...]:
+    return tuple(
+        checked_whole(f"an entry of a mirror's {name}", v, 0) for v in _listed(name, values)
+    )
+
+
+def _pair(values: Any) -> tuple[int, ...]:
+    pair = _entries("swaps", values)
+    if len(pair) != 2:
+        raise ValueError(f"a mirror's swaps are pairs of entries, not {list(pair)}")
+    return pair

@@ -11,6 +11,7 @@ from stable_baselines3.td3.policies import Actor
 from torch import nn
 
 from ..common.array_trees import load_tree, save_tree
+from ..common.mirrors import as_mirrors
 from ..common.reports import reason
 from ..common.torch_helpers import usual_defaults
 from .folding import folding_of
@@ -46,9 +47,12 @@ def save_actor(path: str | os.PathLike[str], actor: Actor, env_id: str) -> None:
         "net_arch": actor.net_arch,
         "activation": activation,
         "clip": extractor.clip,
-        "mirrors": [] if folding is None else [each.plain() for each in folding.mirrors],
-        "actor": actor.state_dict(),
     }
+    if folding is None:
+        saved["actor"] = actor.state_dict()
+    else:  # by another name: who knows no mirrors shall not play it
+        saved["mirrors"] = [each.plain() for each in folding.mirrors]
+        saved["folded_actor"] = actor.state_dict()
     save_tree(path, saved)
 
 
@@ -69,11 +73,13 @@ def load_actor(
         clip, activation = float(saved.get("clip", 5.0)), saved.get("activation", "ReLU")
         if not clip > 0.0:
             raise ValueError(f"its inputs are clipped at {clip}")
-        folding = folding_of(saved.get("mirrors", []), observation_space, action_space)
+        mirrors = as_mirrors(saved.get("mirrors", []))
+        weights = saved["folded_actor" if mirrors else "actor"]
         with usual_defaults():
+            folding = folding_of(mirrors, observation_space, action_space)
             extractor = NormalizedGoalExtractor(observation_space, clip, folding)
         widths = [extractor.features_dim, *saved["net_arch"], *action_space.shape]
-        _check_layers(saved["actor"], widths)  # before anything of their size is allocated
+        _check_layers(weights, widths)  # before anything of their size is allocated
         with usual_defaults():
             actor = FoldedActor(
                 observation_space,
@@ -83,7 +89,7 @@ def load_actor(
                 extractor.features_dim,
                 _ACTIVATIONS[activation],
             )
-        actor.load_state_dict(saved["actor"])
+        actor.load_state_dict(weights)
         actor.set_training_mode(False)
         return actor, str(saved["env_id"])
     except (AttributeError, KeyError, TypeError, RuntimeError, ValueError) as error:

@@ -30,7 +30,8 @@ class Transitions(NamedTuple):
         observations: "observation", "achieved_goal" and "desired_goal", (n, d) each.
         actions: (n, action_dim), in [-1, 1].
         next_observations: as `observations`, one step later.
-        features: normalised observation and desired goal, (n, n_features).
+        features: normalised observation and desired goal, (n, n_features), mirrored
+            where the policy has mirrors.
         next_features: the same one step later.
     """
 

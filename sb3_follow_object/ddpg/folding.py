@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.preprocessing import get_action_dim, get_flattened_obs_dim
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from ..common.mirrors import Mirror, as_mirror
+from ..common.mirrors import Mirror, as_mirrors
+from ..settings.planes import known_mirrors
 
-GOAL_SIZE = 3
+AUTO = "auto"  # the planes of the environment
+_GOAL = 3
 
 
 class Folding(nn.Module):
@@ -37,29 +41,26 @@ class Folding(nn.Module):
         axes = [mirror.axis for mirror in self.mirrors]
         if len(set(axes)) < len(axes):
             raise ValueError(f"mirrors: two stand across the same axis, of {axes}")
-        for number, mirror in enumerate(self.mirrors):
-            needs = mirror.needs
-            if needs[0] > observation_size or needs[1] > action_size:
-                raise ValueError(
-                    f"mirrors: the one across axis {mirror.axis} wants observations of {needs[0]} "
-                    f"entries and actions of {needs[1]}; these have {observation_size} and "
-                    f"{action_size}"
-                )
-            for name, value in _tables(mirror, observation_size, action_size).items():
-                self.register_buffer(f"{name}_{number}", value, persistent=False)
+        for mirror in self.mirrors:
+            sizes = {"observation": observation_size, "action": action_size}
+            for (what, size), needed in zip(sizes.items(), mirror.needs, strict=True):
+                if needed > size:
+                    raise ValueError(
+                        f"mirrors: the one across axis {mirror.axis} tells of entry {needed - 1} "
+                        f"of an {what}, which has {size}"
+                    )
+        self.planes = [_Plane(mirror, observation_size, action_size) for mirror in self.mirrors]
+        self._tables = nn.ModuleList(self.planes)  # moves with the networks
 
     @property
     def device(self) -> th.device:
         """Where its tables are."""
-        return self.get_buffer("order_0").device
+        return next(self.buffers()).device
 
     def states(self, observations: th.Tensor, goals: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return observations (n, d) and goals (n, 3), mirrored where the goals say so."""
-        for number, mirror in enumerate(self.mirrors):
-            order, sign, shift, goal_sign, goal_shift, _ = self._of(number)
-            low = self._low(goals, mirror)
-            observations = th.where(low, observations[:, order] * sign + shift, observations)
-            goals = th.where(low, goals * goal_sign + goal_shift, goals)
+        for plane in self.planes:
+            observations, goals = plane.states(observations, goals)
         return observations, goals
 
     def actions(self, actions: th.Tensor, goals: th.Tensor) -> th.Tensor:
@@ -67,40 +68,54 @@ class Folding(nn.Module):
 
         Twice is once more the action that it was: the same brings a network's answer back.
         """
-        for number, mirror in enumerate(self.mirrors):
-            *_, action_sign = self._of(number)
-            actions = th.where(self._low(goals, mirror), actions * action_sign, actions)
+        for plane in self.planes:
+            actions = plane.actions(actions, goals)
         return actions
 
-    def _of(self, number: int) -> list[th.Tensor]:
-        return [self.get_buffer(f"{name}_{number}") for name in _TABLES]
 
-    @staticmethod
-    def _low(goals: th.Tensor, mirror: Mirror) -> th.Tensor:
-        return (goals[:, mirror.axis] < mirror.at)[:, None]
+class _Plane(nn.Module):
+    """One mirror's tables; a policy has its mirrors besides, so that they need not be saved."""
 
+    order: th.Tensor
+    sign: th.Tensor
+    shift: th.Tensor
+    goal_sign: th.Tensor
+    goal_shift: th.Tensor
+    action_sign: th.Tensor
 
-_TABLES = ("order", "sign", "shift", "goal_sign", "goal_shift", "action_sign")
+    def __init__(self, mirror: Mirror, observation_size: int, action_size: int) -> None:
+        super().__init__()
+        self.axis, self.at = mirror.axis, mirror.at
+        order, sign, shift = mirror.table(observation_size)
+        origin = mirror.goal(np.zeros(_GOAL))
+        tables = {
+            "sign": sign,
+            "shift": shift,
+            "goal_sign": mirror.goal(np.ones(_GOAL)) - origin,
+            "goal_shift": origin,
+            "action_sign": mirror.action_sign(action_size),
+        }
+        self.register_buffer("order", th.from_numpy(order), persistent=False)
+        for name, values in tables.items():
+            self.register_buffer(name, th.from_numpy(values).float(), persistent=False)
 
+    def states(self, observations: th.Tensor, goals: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        low = self._low(goals)
+        mirrored = observations[:, self.order] * self.sign + self.shift
+        return (
+            th.where(low, mirrored, observations),
+            th.where(low, goals * self.goal_sign + self.goal_shift, goals),
+        )
 
-def _tables(mirror: Mirror, observation_size: int, action_size: int) -> dict[str, th.Tensor]:
-    order, sign = th.arange(observation_size), th.ones(observation_size)
-    shift, action_sign = th.zeros(observation_size), th.ones(action_size)
-    sign[[*mirror.positions, *mirror.signs]] = -1.0
-    shift[[*mirror.positions]] = 2.0 * mirror.at
-    for first, second in mirror.swaps:
-        order[[first, second]] = th.tensor([second, first])
-    goal_sign, goal_shift = th.ones(GOAL_SIZE), th.zeros(GOAL_SIZE)
-    goal_sign[mirror.axis], goal_shift[mirror.axis] = -1.0, 2.0 * mirror.at
-    action_sign[[*mirror.actions]] = -1.0
-    tables = order, sign, shift, goal_sign, goal_shift, action_sign
-    return dict(zip(_TABLES, tables, strict=True))
+    def actions(self, actions: th.Tensor, goals: th.Tensor) -> th.Tensor:
+        return th.where(self._low(goals), actions * self.action_sign, actions)
+
+    def _low(self, goals: th.Tensor) -> th.Tensor:
+        return (goals[:, self.axis] < self.at)[:, None]
 
 
 def folding_of(
-    mirrors: Sequence[Mirror | Mapping[str, Any]],
-    observation_space: spaces.Space,
-    action_space: spaces.Box,
+    mirrors: Sequence[Mirror], observation_space: spaces.Space, action_space: spaces.Box
 ) -> Folding | None:
     """Return what folds over mirrors, or None where there are none.
 
@@ -109,24 +124,65 @@ def folding_of(
     """
     if not mirrors:
         return None
-    assert isinstance(observation_space, spaces.Dict)
-    size = get_flattened_obs_dim(observation_space["observation"])
-    if get_flattened_obs_dim(observation_space["desired_goal"]) != GOAL_SIZE:
+    if not isinstance(observation_space, spaces.Dict):
+        raise ValueError("mirrors are for observations that say the goal")
+    if get_flattened_obs_dim(observation_space["desired_goal"]) != _GOAL:
         raise ValueError("mirrors are for goals that are positions (3,)")
-    return Folding([as_mirror(each) for each in mirrors], size, *action_space.shape)
+    size = get_flattened_obs_dim(observation_space["observation"])
+    folding = Folding(mirrors, size, get_action_dim(action_space))
+    low, high = action_space.low.ravel(), action_space.high.ravel()
+    for mirror in mirrors:
+        for entry in mirror.actions:
+            if low[entry] != -high[entry]:
+                raise ValueError(
+                    f"mirrors: entry {entry} of an action changes its sign, but its bounds are "
+                    f"{low[entry]} and {high[entry]}"
+                )
+    return folding
 
 
-def resolved_mirrors(given: Any, env: VecEnv | None) -> list[dict[str, Any]]:
-    """Return mirrors as plain values, those of the environment for "auto".
+def resolved_mirrors(given: Any, env: VecEnv | None) -> list[Mirror]:
+    """Return mirrors, those of the environment for "auto".
+
+    An environment's own are what its attribute `mirrors` holds; of one without it those that come
+    with the package, if they do.
 
     Args:
-        given: "auto", None, or mirrors or their fields.
-        env: that is trained in; one without an attribute `mirrors` has none.
+        given: "auto", None, or a list of mirrors or their fields.
+        env: that is trained in.
 
     Raises:
         ValueError: mirrors that are none.
     """
-    if given == "auto":
-        has = env is not None and env.has_attr("mirrors")
-        given = env.get_attr("mirrors", indices=[0])[0] if has and env is not None else ()
-    return [as_mirror(mirror).plain() for mirror in given or ()]
+    if given == AUTO:
+        return _named(env) if env is not None else []
+    return as_mirrors([] if given is None else given)
+
+
+def warn_of_other_planes(mirrors: Sequence[Mirror], env: VecEnv | None) -> None:
+    """Warn where an environment names its planes and a policy folds over others."""
+    if not mirrors or env is None or not env.has_attr("mirrors"):
+        return
+    named = _named(env)
+    others = [mirror.axis for mirror in mirrors if mirror not in named]
+    if others:
+        warnings.warn(
+            f"The policy folds over planes that the environment does not name, across axis {others}"
+            ": states that differ there look alike to it.",
+            stacklevel=3,
+        )
+
+
+def _named(env: VecEnv) -> list[Mirror]:
+    if not env.has_attr("mirrors"):
+        spec = env.get_attr("spec", indices=[0])[0] if env.has_attr("spec") else None
+        return (
+            [] if spec is None else known_mirrors(spec.id, env.observation_space, env.action_space)
+        )
+    held = env.get_attr("mirrors", indices=[0])[0]
+    try:
+        return as_mirrors(held)
+    except ValueError as error:
+        raise ValueError(
+            f"the environment's attribute mirrors: {error}; or say policy_kwargs.mirrors=null"
+        ) from error

@@ -28,10 +28,10 @@ from ..settings.learning import AlgorithmSettings
 from .auxiliary import Transitions, make_auxiliary, resolve_auxiliary
 from .env_checks import check_goals, check_rewards, check_wrappers, horizon_of
 from .exploration import explored
-from .folding import resolved_mirrors
+from .folding import resolved_mirrors, warn_of_other_planes
 from .input_moments import InputMoments
 from .kept_state import KeptDDPG
-from .policies import HerPolicy
+from .policies import HerPolicy, NormalizedGoalExtractor
 from .updates import COLUMNS, Updates
 
 SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
@@ -218,8 +218,9 @@ class HerDDPG(KeptDDPG):
         if self.auxiliary is not None:
             self.auxiliary = resolve_auxiliary(self.auxiliary, self.env)
         if self.policy_kwargs.get("mirrors") is not None:
-            given = self.policy_kwargs["mirrors"]
-            self.policy_kwargs["mirrors"] = resolved_mirrors(given, self.env)
+            mirrors = resolved_mirrors(self.policy_kwargs["mirrors"], self.env)
+            self.policy_kwargs["mirrors"] = [mirror.plain() for mirror in mirrors]
+            warn_of_other_planes(mirrors, self.env)
         super()._setup_model()
         with_steps = isinstance(self.replay_buffer, FollowObjectReplayBuffer | None)
         if self.hindsight_bound and not with_steps:
@@ -267,6 +268,7 @@ class HerDDPG(KeptDDPG):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:  # noqa: D102
         makes_replay = self.replay_buffer is None
         super().set_env(env, force_reset)
+        warn_of_other_planes(self.policy.mirrors, self.env)
         if makes_replay:
             self._device_replay = self._make_device_replay()
 
@@ -323,7 +325,8 @@ class HerDDPG(KeptDDPG):
     def _train(self, gradient_steps: int, batch_size: int) -> None:
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
-        auxiliary, folding = self.auxiliary_critic, self.policy.folding
+        auxiliary, extractor = self.auxiliary_critic, self.actor.features_extractor
+        assert isinstance(extractor, NormalizedGoalExtractor)
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         self._update_learning_rate(optimizers + ([auxiliary.optimizer] if auxiliary else []))
         self._update_moments()
@@ -335,18 +338,17 @@ class HerDDPG(KeptDDPG):
                 check_rewards(data.rewards, self.target_clip == "auto", self.hindsight_bound)
             bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
             # All networks share their input moments, so features are computed once.
-            actions = data.actions
-            if folding is not None:
-                goals = data.observations["desired_goal"].float().flatten(1)
-                actions = folding.actions(actions, goals)
             chunk = Transitions(
                 data.observations,
-                actions,
+                data.actions,
                 data.next_observations,
-                self.actor.features_extractor(data.observations),
-                self.actor.features_extractor(data.next_observations),
+                extractor(data.observations),
+                extractor(data.next_observations),
             )
-            told.append(self._updates.run(chunk, data.rewards, data.dones, bounds, batch_size))
+            actions = extractor.fold_actions(data.actions, data.observations)
+            told.append(
+                self._updates.run(chunk, actions, data.rewards, data.dones, bounds, batch_size)
+            )
 
         # A plain mean until there are enough updates for the share to be left.
         decay = min(self.average_decay**gradient_steps, 1.0 - gradient_steps / self._n_updates)

@@ -63,6 +63,7 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
         """
         return {
             "policy": self.policy.state_dict(),
+            "mirrors": [mirror.plain() for mirror in self.policy.mirrors],
             "actor_optimizer": self.actor.optimizer.state_dict(),
             "critic_optimizer": self.critic.optimizer.state_dict(),
             "auxiliary": None
@@ -78,7 +79,16 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
         }
 
     def load_training_state(self, state: dict[str, Any]) -> None:
-        """Continue from `training_state` of an algorithm with the same networks."""
+        """Continue from `training_state` of an algorithm with the same networks.
+
+        Raises:
+            ValueError: they fold over other planes.
+        """
+        mirrors = [mirror.plain() for mirror in self.policy.mirrors]
+        if state.get("mirrors", mirrors) != mirrors:
+            raise ValueError(
+                f"the policy was trained with the mirrors {state['mirrors']}, not {mirrors}"
+            )
         self.policy.load_state_dict(state["policy"])
         self.actor.optimizer.load_state_dict(state["actor_optimizer"])
         self.critic.optimizer.load_state_dict(state["critic_optimizer"])

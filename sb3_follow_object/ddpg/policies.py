@@ -15,10 +15,10 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
-from ..common.mirrors import Mirror, as_mirror
+from ..common.mirrors import Mirror, as_mirrors
 from ..common.torch_helpers import WholeModule, one_thread_after_forks, usual_defaults
 from ..settings.learning import PolicySettings
-from .folding import Folding, folding_of
+from .folding import AUTO, Folding, folding_of
 from .layer_norm import LayerNorm
 
 one_thread_after_forks()
@@ -53,6 +53,18 @@ class NormalizedGoalExtractor(BaseFeaturesExtractor):
         self.register_buffer("mean", th.zeros(dim))
         self.register_buffer("std", th.ones(dim))
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        if "folding" not in self._modules:  # pickled before there was any
+            vars(self).setdefault("folding", None)
+
+    def fold_actions(self, actions: th.Tensor, observations: PyTorchObs) -> th.Tensor:
+        """Mirror actions (n, a) where `forward` mirrors the states, or back."""
+        if self.folding is None:
+            return actions
+        assert isinstance(observations, dict)
+        return self.folding.actions(actions, observations["desired_goal"].float().flatten(1))
+
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
         """Map a batch of observations to features (n, features_dim)."""
         parts = tuple(observations[key].float().flatten(1) for key in self.keys)
@@ -68,11 +80,7 @@ class FoldedActor(Actor):
     def forward(self, obs: PyTorchObs) -> th.Tensor:
         """Map a batch of observations to actions (n, action_dim)."""
         actions = super().forward(obs)  # type: ignore[arg-type]
-        folding = self.features_extractor.folding
-        if folding is None:
-            return actions
-        assert isinstance(folding, Folding) and isinstance(obs, dict)
-        return folding.actions(actions, obs["desired_goal"].float().flatten(1))
+        return _extractor_of(self).fold_actions(actions, obs)
 
 
 class LayerNormCritic(ContinuousCritic):
@@ -89,6 +97,28 @@ class LayerNormCritic(ContinuousCritic):
             q_net = nn.Sequential(*layers)
             self.add_module(f"qf{idx}", q_net)
             self.q_networks[idx] = q_net
+
+
+class FoldedCritic(ContinuousCritic):
+    """SB3's critic, which sees actions mirrored where states are."""
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """Map a batch of observations and actions to the value of each critic (n, 1)."""
+        return super().forward(obs, _extractor_of(self).fold_actions(actions, obs))  # type: ignore[arg-type]
+
+    def q1_forward(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """Map them to the value of the first critic (n, 1)."""
+        return super().q1_forward(obs, _extractor_of(self).fold_actions(actions, obs))  # type: ignore[arg-type]
+
+
+class FoldedLayerNormCritic(FoldedCritic, LayerNormCritic):
+    """Both."""
+
+
+def _extractor_of(network: Actor | ContinuousCritic) -> NormalizedGoalExtractor:
+    extractor = network.features_extractor
+    assert isinstance(extractor, NormalizedGoalExtractor)
+    return extractor
 
 
 def with_fused_adam(kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -133,9 +163,9 @@ class HerPolicy(WholeModule, TD3Policy):
             )
         self.critic_layer_norm = critic_layer_norm
         self.features_clip = features_clip
-        self.mirrors = [as_mirror(each).plain() for each in mirrors or ()]
-        folding = folding_of(self.mirrors, observation_space, action_space)
+        self.mirrors = _given(mirrors)
         with usual_defaults():
+            folding = folding_of(self.mirrors, observation_space, action_space)
             super().__init__(
                 observation_space,
                 action_space,
@@ -154,7 +184,7 @@ class HerPolicy(WholeModule, TD3Policy):
         own = {
             "critic_layer_norm": self.critic_layer_norm,
             "features_clip": self.features_clip,
-            "mirrors": self.mirrors,
+            "mirrors": [mirror.plain() for mirror in self.mirrors],
         }
         return {**arguments, **own}
 
@@ -181,9 +211,7 @@ class HerPolicy(WholeModule, TD3Policy):
     @property
     def folding(self) -> Folding | None:
         """What brings states and actions to one side of planes of symmetry, if there are any."""
-        extractor = self.actor.features_extractor
-        assert isinstance(extractor, NormalizedGoalExtractor)
-        return extractor.folding
+        return _extractor_of(self.actor).folding
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """Build the actor (or its target)."""
@@ -195,7 +223,7 @@ class HerPolicy(WholeModule, TD3Policy):
     ) -> ContinuousCritic:
         """Build one critic (or its target)."""
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        critic_class = LayerNormCritic if self.critic_layer_norm else ContinuousCritic
+        critic_class = FoldedLayerNormCritic if self.critic_layer_norm else FoldedCritic
         return critic_class(**critic_kwargs).to(self.device)
 
     def live_and_targets(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
@@ -211,7 +239,12 @@ class HerPolicy(WholeModule, TD3Policy):
         """Give every network the same moments, (features_dim,) each."""
         actors = (self.actor, self.actor_target, self.actor_average)
         for net in (*actors, self.critic, self.critic_target):
-            extractor = net.features_extractor
-            assert isinstance(extractor, NormalizedGoalExtractor)
+            extractor = _extractor_of(net)
             extractor.mean.copy_(mean)
             extractor.std.copy_(std)
+
+
+def _given(mirrors: Any) -> list[Mirror]:
+    if mirrors == AUTO:
+        raise ValueError('mirrors "auto" are those of an environment, which HerDDPG asks for them')
+    return as_mirrors([] if mirrors is None else mirrors)

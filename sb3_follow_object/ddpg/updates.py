@@ -61,6 +61,7 @@ class Updates:
     def run(
         self,
         chunk: Transitions,
+        actions: th.Tensor,
         rewards: th.Tensor,
         dones: th.Tensor,
         bounds: th.Tensor,
@@ -70,6 +71,7 @@ class Updates:
 
         Args:
             chunk: of n_batches * batch_size transitions.
+            actions: theirs, as the networks see them, (n, action_dim).
             rewards: of the transitions, (n, 1).
             dones: (n, 1), 1 where the episode terminated.
             bounds: the least targets that the episodes prove possible, (n, 1).
@@ -78,7 +80,7 @@ class Updates:
         inputs = {
             "features": chunk.features,
             "next_features": chunk.next_features,
-            "actions": chunk.actions,
+            "actions": actions,
             "rewards": rewards,
             "dones": dones,
             "bounds": bounds,

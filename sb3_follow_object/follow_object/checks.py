@@ -18,8 +18,10 @@ from ..any_task.tasks import (
 )
 from ..common.numbers import checked_whole
 from ..common.torch_helpers import usable_device
+from ..ddpg.folding import AUTO
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs import IDS
+from ..object_stage.networks import SAY_NO_MIRRORS
 from ..object_stage.sldr import task_of_package
 from ..reach.approach import BEHIND, check_reachable, reach_first_settings
 from ..settings.fields import checked, settings_of
@@ -70,6 +72,9 @@ def check_algorithms(
     # What these two need is not there yet; their settings have been checked.
     if needs_networks:
         task_of_package(env)
+        mirrors = (settings["object_algorithm"].get("policy_kwargs") or {}).get("mirrors")
+        if mirrors not in (None, [], AUTO):
+            raise ValueError(SAY_NO_MIRRORS)
         del arguments["auxiliary"]
     if settings["imagine"] and arguments.get("replay_buffer_kwargs"):
         arguments["replay_buffer_kwargs"]["imagined_ratio"] = 0.0

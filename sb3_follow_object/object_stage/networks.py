@@ -25,6 +25,9 @@ from ..settings.learning import InverseSettings
 FILE = "object_networks.safetensors"
 FORMAT = 1
 OBSERVATION, GOAL, ACTION = 12, 3, 7  # of the object's environment, without a context
+SAY_NO_MIRRORS = (
+    "SLDR's reward reads an object's policy without mirrors; leave them out of object_algorithm"
+)
 
 
 class ObjectNetworks(WholeModule):
@@ -136,10 +139,7 @@ class ObjectNetworks(WholeModule):
                 f"{policy.activation_fn.__name__}; leave activation_fn out of object_algorithm"
             )
         if policy.mirrors:
-            raise ValueError(
-                "SLDR's reward reads an object policy without mirrors; leave them out of "
-                "object_algorithm"
-            )
+            raise ValueError(SAY_NO_MIRRORS)
         pi, qf = get_actor_critic_arch(policy.net_arch)
         extractor = model.actor.features_extractor
         assert isinstance(model.observation_space, spaces.Dict)

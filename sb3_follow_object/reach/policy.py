@@ -115,7 +115,7 @@ class ReachPolicy(WholeCopies):
         chunk = Transitions(here, tensor(actions), there, extractor(here), extractor(there))
         rewards = tensor(reached - 1.0)[:, None]
         bounds = (th.pow(self.gamma, tensor(steps)[:, None]) - 1.0) / (1.0 - self.gamma)
-        self._updates.run(chunk, rewards, th.zeros_like(rewards), bounds, batch_size)
+        self._updates.run(chunk, chunk.actions, rewards, th.zeros_like(rewards), bounds, batch_size)
         with th.no_grad():
             played = self.policy.actor.mu(chunk.features[:batch_size])
         self.idle = (played.std(dim=0) < _IDLE).cpu().numpy()

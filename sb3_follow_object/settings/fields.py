@@ -34,6 +34,10 @@ class Said:
     kind: str
 
 
+class Unfit(ValueError):
+    """Raised by what reads a value with parts: its sentence says which of them cannot be meant."""
+
+
 Whole = Annotated[int, BeforeValidator(as_whole), Said("a whole number")]
 Number = Annotated[float, BeforeValidator(as_number), Said("a number")]
 Flag = Annotated[bool, BeforeValidator(as_flag), Said("true or false")]
@@ -139,7 +143,11 @@ class Setting:
         try:
             return self._adapter.validate_python(value)
         except ValidationError as error:
-            reason = self._reason(value, str(error.errors()[0]["type"]))
+            first = error.errors()[0]
+            cause = first.get("ctx", {}).get("error")
+            if isinstance(cause, Unfit):
+                raise ValueError(f"{before}{self.name}: {cause}") from None
+            reason = self._reason(value, str(first["type"]))
             raise ValueError(f"{before}{self.name} {reason}") from None
 
     def _reason(self, value: Any, error: str) -> str:

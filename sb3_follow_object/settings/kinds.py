@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from ..common.mirrors import as_mirror
+from ..common.mirrors import as_mirrors
 from ..common.numbers import as_number, as_whole
-from .fields import Said
+from .fields import Said, Unfit
 
 LAYERS_LIMIT, WIDTH_LIMIT = 16, 8192  # of networks that anybody means
 CRITICS_LIMIT = 16
@@ -102,9 +102,10 @@ def _standoff(value: Any) -> Any:
 def _mirrors(value: Any) -> Any:
     if isinstance(value, str) and value == "auto":
         return "auto"
-    if not isinstance(value, list | tuple):
-        raise ValueError
-    return [as_mirror(mirror).plain() for mirror in value]
+    try:
+        return [mirror.plain() for mirror in as_mirrors(value)]
+    except ValueError as error:
+        raise Unfit(str(error)) from error
 
 
 def _policy(value: Any) -> Any:
@@ -139,7 +140,7 @@ Standoff = Annotated[Any, BeforeValidator(_standoff), Said('"auto" or a number o
 Mirrors = Annotated[
     Any,
     BeforeValidator(_mirrors),
-    Said('"auto" or a list of mirrors, each with axis, at, positions, signs, swaps and actions'),
+    Said('"auto" or a list of mirrors, each with axis and at'),
 ]
 Policy = Annotated[Any, BeforeValidator(_policy), Said("MultiInputPolicy")]
 PythonClass = Annotated[type, Said("a class, which only Python code can give")]

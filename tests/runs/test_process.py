@@ -77,6 +77,8 @@ SETTINGS: dict[str, Callable[[], AbstractContextManager[Any]]] = {
     "warnings are errors": warnings_as_errors,
 }
 
+MIRRORS = [{"axis": 0, "at": 0.15, "positions": [0], "actions": [0]}]  # of a point that is moved
+
 
 def predictor() -> np.ndarray:
     paths, goals = toy.paths(20)
@@ -94,7 +96,7 @@ def her_ddpg(**options: Any) -> np.ndarray:
 def with_everything() -> np.ndarray:
     return her_ddpg(
         auxiliary={"name": "rnd", "hidden": [8], "n_outputs": 4},
-        policy_kwargs={"net_arch": [8], "critic_layer_norm": True},
+        policy_kwargs={"net_arch": [8], "critic_layer_norm": True, "mirrors": MIRRORS},
         replay_buffer_kwargs={"cher": {}, "moved_ratio": 0.5, "min_goal_distance": 0.05},
         average_decay=0.9,
         update_threads=2,
@@ -107,7 +109,7 @@ def on_device() -> np.ndarray:
 
 
 def actor_file(folder: Path) -> np.ndarray:
-    model = learner("HerDDPG", numbered(2))
+    model = learner("HerDDPG", numbered(2), policy_kwargs={"net_arch": [8], "mirrors": MIRRORS})
     save_actor(folder / "actor", model.policy.actor_average, "x")
     actor, _ = load_actor(folder / "actor", model.observation_space, model.action_space)
     model.policy.save(str(folder / "policy"))
