@@ -74,7 +74,7 @@ def load_actor(
         if not clip > 0.0:
             raise ValueError(f"its inputs are clipped at {clip}")
         mirrors = as_mirrors(saved.get("mirrors", []))
-        weights = saved["folded_actor" if mirrors else "actor"]
+        weights = saved["folded_actor" if "folded_actor" in saved else "actor"]
         with usual_defaults():
             folding = folding_of(mirrors, observation_space, action_space)
             extractor = NormalizedGoalExtractor(observation_space, clip, folding)
