@@ -63,8 +63,9 @@ class Mirror:
         return max(told, default=-1) + 1, max(self.actions, default=-1) + 1
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
-        """Return the mirror image of observations (..., d)."""
+        """Return the mirror image of observations (..., d), in their dtype."""
         order, sign, shift = self.table(observation.shape[-1])
+        sign, shift = sign.astype(observation.dtype), shift.astype(observation.dtype)
         return observation[..., order] * sign + shift
 
     def goal(self, goal: np.ndarray) -> np.ndarray:

@@ -52,11 +52,6 @@ class Folding(nn.Module):
         self.planes = [_Plane(mirror, observation_size, action_size) for mirror in self.mirrors]
         self._tables = nn.ModuleList(self.planes)  # moves with the networks
 
-    @property
-    def device(self) -> th.device:
-        """Where its tables are."""
-        return next(self.buffers()).device
-
     def states(self, observations: th.Tensor, goals: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return observations (n, d) and goals (n, 3), mirrored where the goals say so."""
         for plane in self.planes:

@@ -295,7 +295,7 @@ class HerDDPG(KeptDDPG):
     def _update_moments(self) -> None:
         """Standardise inputs from now on by all that has been stored."""
         assert self.replay_buffer is not None
-        if self.moments.take(self.replay_buffer, self.policy.folding):
+        if self.moments.take(self.replay_buffer, self.policy.mirrors):
             self.policy.set_moments(
                 th.as_tensor(self.moments.mean, dtype=th.float32),
                 th.as_tensor(self.moments.std, dtype=th.float32),

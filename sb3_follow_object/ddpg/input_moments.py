@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 
-from .folding import Folding
+from ..common.mirrors import Mirror
 
 # Floor of the standard deviations, so that entries that hardly vary are not blown up.
 MIN_STD = 0.01
@@ -32,12 +32,12 @@ class InputMoments(RunningMeanStd):
         """Standard deviations (n_features,), none too small to divide by."""
         return np.sqrt(self.var).clip(min=MIN_STD)
 
-    def take(self, buffer: ReplayBuffer, folding: Folding | None = None) -> bool:
+    def take(self, buffer: ReplayBuffer, mirrors: Sequence[Mirror] = ()) -> bool:
         """Take in what was stored since the last call; goals count as shown and as achieved.
 
         Args:
             buffer: of the algorithm.
-            folding: that the networks' inputs have come through.
+            mirrors: over which the networks' inputs are folded.
 
         Returns:
             Whether there was anything.
@@ -50,21 +50,21 @@ class InputMoments(RunningMeanStd):
         if new == 0:
             return False
         with np.errstate(under="ignore"):
-            self._take_rows(buffer, new, folding)
+            self._take_rows(buffer, new, mirrors)
         return True
 
-    def _take_rows(self, buffer: ReplayBuffer, new: int, folding: Folding | None) -> None:
+    def _take_rows(self, buffer: ReplayBuffer, new: int, mirrors: Sequence[Mirror]) -> None:
         """Take in the last `new` time-steps."""
         rows = (buffer.pos - new + np.arange(new)) % buffer.buffer_size
         obs = buffer.observations["observation"][rows].reshape(new * buffer.n_envs, -1)
         for key in ("desired_goal", "achieved_goal"):
             goals = buffer.next_observations[key][rows].reshape(len(obs), -1)
-            inputs: tuple[np.ndarray, ...] = obs, goals
-            if folding is not None:
-                at = folding.device
-                states = (th.as_tensor(part, dtype=th.float32, device=at) for part in inputs)
-                inputs = tuple(part.cpu().numpy() for part in folding.states(*states))
-            self.update(np.concatenate(inputs, axis=1).astype(np.float64))
+            inputs = obs
+            for mirror in mirrors:
+                low = (goals[:, mirror.axis] < mirror.at)[:, None]
+                inputs = np.where(low, mirror.observation(inputs), inputs)
+                goals = np.where(low, mirror.goal(goals), goals)
+            self.update(np.concatenate([inputs, goals], axis=1).astype(np.float64))
 
     def begin_anew(self, buffer: ReplayBuffer) -> None:
         """Take in from now on what an empty buffer is given, in addition to what has been."""

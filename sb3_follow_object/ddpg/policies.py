@@ -163,9 +163,8 @@ class HerPolicy(WholeModule, TD3Policy):
             )
         self.critic_layer_norm = critic_layer_norm
         self.features_clip = features_clip
-        self.mirrors = _given(mirrors)
         with usual_defaults():
-            folding = folding_of(self.mirrors, observation_space, action_space)
+            folding = folding_of(_given(mirrors), observation_space, action_space)
             super().__init__(
                 observation_space,
                 action_space,
@@ -209,9 +208,10 @@ class HerPolicy(WholeModule, TD3Policy):
             th._foreach_lerp_(average, live, 1.0 - decay)
 
     @property
-    def folding(self) -> Folding | None:
-        """What brings states and actions to one side of planes of symmetry, if there are any."""
-        return _extractor_of(self.actor).folding
+    def mirrors(self) -> tuple[Mirror, ...]:
+        """The planes over which the networks' inputs are folded."""
+        folding = _extractor_of(self.actor).folding
+        return () if folding is None else folding.mirrors
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """Build the actor (or its target)."""

@@ -144,8 +144,7 @@ def test_training_folds_states_and_actions_alike(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(model, "_sample", keep_sample)
     model.learn(20)
     (chunk, actions), data = seen[0], sampled[0][0]
-    folding = model.policy.folding
-    assert folding is not None
+    folding = Folding(model.policy.mirrors, 25, 4)
     observation, goal = folding.states(
         data.observations["observation"], data.observations["desired_goal"]
     )
@@ -266,8 +265,7 @@ gym.register("MirroredArm-v0", MirroredArm, max_episode_steps=5)
 def test_others_environments_name_their_planes(n_threads: int) -> None:
     env = robot_vec_env("MirroredArm-v0", 2, n_threads)
     model = _model(env, mirrors="auto", net_arch=[8])
-    assert model.policy.folding is not None
-    assert [mirror.axis for mirror in model.policy.folding.mirrors] == [1]
+    assert [mirror.axis for mirror in model.policy.mirrors] == [1]
     env.close()
 
 
