@@ -1,7 +1,7 @@
 """The object of every robot in docs/robots.md, thrown alone and in its whole scene.
 
-Each package wants a mujoco of its own, so that no environment holds all of them: what needs one that
-is not installed is skipped. docs/robots.md says how to install each.
+Meta-World and robosuite want a mujoco each, so no installation holds all: what needs a package that
+is not there is skipped. docs/robots.md says how to install each.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ FREE = np.array([0.2, 0.4, 1.0, 1.0, 2.0, 3.0])  # metres and radians a second
 def test_an_object_thrown_alone_moves_as_in_the_whole_scene(
     package: str, env_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip(package, reason=f"{package} wants a mujoco of its own (docs/robots.md)")
+    pytest.importorskip(package, reason=f"{package} is installed by itself (docs/robots.md)")
     monkeypatch.setattr(sys, "path", [str(ROOT / "benchmarks" / "robots"), *sys.path])
     env = gym.make(import_task(env_id))
     seen = observe(env, n_resets=5, n_steps=5)
