@@ -14,6 +14,7 @@ from .envs import register_envs, register_task
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
+    from .any_task.effectors import fingertips as fingertips
     from .callbacks.curriculum_callback import CurriculumCallback as CurriculumCallback
     from .callbacks.eval_callback import OriginalGoalEvalCallback as OriginalGoalEvalCallback
     from .callbacks.reach_callback import ReachCallback as ReachCallback
@@ -68,6 +69,7 @@ _HOME = {
     "RunConfig": "settings.run_config",
     "evaluate": "runs.evaluation",
     "export_onnx": "ddpg.onnx_files",
+    "fingertips": "any_task.effectors",
     "get_object_networks": "runs.predictor_cache",
     "get_predictor": "runs.predictor_cache",
     "load_actor": "ddpg.actor_files",

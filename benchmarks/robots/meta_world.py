@@ -5,6 +5,7 @@ import mujoco
 import numpy as np
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
+from sb3_follow_object import fingertips
 from sb3_follow_object.envs import RobotTask
 
 TASKS = ("push-wall", "pick-place-wall", "shelf-place", "peg-insert-side", "drawer-open")
@@ -39,17 +40,13 @@ def goal(env, observation):
     return env._get_pos_objects(), env._target_pos
 
 
-def effector(env):
-    return env.tcp_center  # its observation holds the wrist, 45 mm above
-
-
 def make(task, **options):
     within = DRAWER_REACHED if task == "drawer-open" else REACHED
 
     def is_success(achieved, desired):
         return np.linalg.norm(achieved - desired, axis=-1) <= within
 
-    return RobotTask(Seeded(task), goal, is_success, effector=effector)
+    return RobotTask(Seeded(task), goal, is_success, effector=fingertips)
 
 
 for task in TASKS:

@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import ogbench  # noqa: F401 - registers cube-single-v0
 
+from sb3_follow_object import fingertips
 from sb3_follow_object.envs import RobotTask
 
 REACHED = 0.04  # metres, as in its own success
@@ -14,10 +15,6 @@ def goal(env, observation):
     return env._data.body("object_0").xpos, env._data.body("object_target_0").xpos
 
 
-def effector(env):
-    return env._data.site("ur5e/robotiq/pinch").xpos  # its observation holds ten times that
-
-
 def is_success(achieved, desired):
     return np.linalg.norm(achieved - desired, axis=-1) <= REACHED
 
@@ -25,7 +22,7 @@ def is_success(achieved, desired):
 def make(**options):
     # In its mode "task" a reset draws one of five tasks, and not from the seed.
     env = gym.make("cube-single-v0", mode="data_collection", terminate_at_goal=False, **options)
-    return RobotTask(env.unwrapped, goal, is_success, effector=effector)
+    return RobotTask(env.unwrapped, goal, is_success, effector=fingertips)
 
 
 gym.register("OGBench/cube-single-v0", make, max_episode_steps=STEPS)

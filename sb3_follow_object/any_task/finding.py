@@ -8,7 +8,8 @@ import gymnasium as gym
 import numpy as np
 
 from ..envs.physics_engine import mujoco
-from ..envs.robot_parts import body_name, carrier, robot_bodies, touching_geoms
+from ..envs.robot_parts import body_name, carrier, robot_bodies
+from .effectors import Fingertips
 from .physics_access import physics_of
 
 N_RESETS, N_STEPS = 20, 30  # watched, the steps after one reset at random
@@ -177,7 +178,9 @@ def find_effector(seen: Observed, entries: tuple[int, int, int] | None = None) -
         entries: where the observation is known to hold it; None looks for it.
     """
     robot = robot_bodies(seen.model)
-    tips = _fingertips(seen, robot)
+    if not robot.any():
+        return None
+    tips = Fingertips(seen.model).middle(seen.positions, seen.rotations)
     if entries is not None:
         return _effector(seen, entries, tips)
     points = np.concatenate([seen.sites, seen.positions], axis=1)
@@ -196,38 +199,6 @@ def find_effector(seen: Observed, entries: tuple[int, int, int] | None = None) -
 def _effector(seen: Observed, entries: tuple[int, int, int], tips: np.ndarray) -> Effector:
     told = seen.observations[:, entries]
     return Effector(entries, float(np.linalg.norm(told - tips, axis=1).mean()))
-
-
-def _fingertips(seen: Observed, robot: np.ndarray) -> np.ndarray:
-    """The middle of the ends of what hangs last on the robot, (n, 3): what touches an object."""
-    model = seen.model
-    depth = np.zeros(model.nbody, dtype=int)
-    for body in range(1, model.nbody):  # parents come before their children
-        depth[body] = depth[model.body_parentid[body]] + int(model.body_jntnum[body] > 0)
-    geoms = np.flatnonzero(robot[model.geom_bodyid])
-    touching = geoms[touching_geoms(model)[geoms]]
-    geoms = touching if touching.size else geoms
-    if not geoms.size:
-        return seen.positions[:, robot & (depth == depth[robot].max())].mean(axis=1)
-    of_geoms = depth[model.geom_bodyid[geoms]]
-    last = geoms[of_geoms == of_geoms.max()]
-    rest = mujoco.MjData(model)  # all joints where the model was drawn
-    mujoco.mj_kinematics(model, rest)
-    return np.mean([_far_end(seen, rest, int(geom)) for geom in last], axis=0)
-
-
-def _far_end(seen: Observed, rest: mujoco.MjData, geom: int) -> np.ndarray:
-    """The end of a geom's longest side that is farther from the joint before its body's, (n, 3)."""
-    model, body = seen.model, int(seen.model.geom_bodyid[geom])
-    before = carrier(model, int(model.body_parentid[carrier(model, body)]))
-    frame = np.zeros(9)
-    mujoco.mju_quat2Mat(frame, model.geom_quat[geom])
-    centre, half = np.split(model.geom_aabb[geom], 2)
-    long = np.where(np.arange(3) == half.argmax(), half, 0.0)
-    ends = model.geom_pos[geom] + (centre + np.stack([long, -long])) @ frame.reshape(3, 3).T
-    at_rest = rest.xpos[body] + ends @ rest.xmat[body].reshape(3, 3).T
-    far = ends[np.linalg.norm(at_rest - rest.xpos[before], axis=1).argmax()]
-    return seen.positions[:, body] + seen.rotations[:, body] @ far
 
 
 def _passive_roots(model: mujoco.MjModel) -> list[int]:

@@ -174,7 +174,8 @@ def _told(env_id: str, found: Effector | None) -> tuple[int, int, int]:
     if found is None:
         raise ValueError(
             f"{env_id!r}: no part of the robot has its position in metres in the observation; "
-            "tell it there with effector=, a function of the environment, or say reach=null"
+            "tell it there with effector=, a function of the environment such as "
+            "sb3_follow_object.fingertips, or say reach=null"
         )
     return found.entries
 

@@ -51,7 +51,8 @@ class FollowObject:
             achieved and the desired position, (3,) metres each.
         is_success: likewise of (achieved, desired): whether the goal is reached.
         effector: likewise of (env): position of what touches the object, (3,) metres, where the
-            observation does not hold it; is told at the observation's end.
+            observation does not hold it; is told at the observation's end. `fingertips` reads it
+            from any simulation.
         lift: whether the object may leave its surface in the first stage; "auto" decides by the
             heights of the goals, and by whether the object learns. The opposite of
             `object_on_table`.
