@@ -4,25 +4,55 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from ..common.mirrors import Mirror
-from .tasks import COMMON, Box, Task
+from .tasks import COMMON, TABLE_HALF_SIZE, Box, Region, Task, reference_point
 
 # The robot's observation and action (`FetchSimulation`), mirrored in x and in y. The fingers lie
-# beside each other along y. The table's middle is the arm's to 6 mm, so all but the outermost of
-# what it can do has a mirror image: tests measure it.
+# beside each other along y. What the arm can do has a mirror image over any plane near the table's
+# middle, all but the outermost of it: tests measure it.
 _FETCH = (
     Mirror(0, COMMON.table[0], (0, 3), (6, 12, 13, 14, 18, 19, 20), (), (0,)),
     Mirror(1, COMMON.table[1], (1, 4), (7, 11, 13, 15, 17, 19, 21), ((9, 10), (23, 24)), (1,)),
 )
+_SAME_MIDDLE = 0.01  # metres between the middles of starts and of goals
 
 
 def fetch_mirrors(task: Task) -> tuple[Mirror, ...]:
-    """Return the planes through the table's middle over which a task's obstacles are symmetric."""
-    return tuple(
+    """Return the planes over which a task's episodes are symmetric.
+
+    Where there are obstacles it is the table's middle over which they must be, and leave a way past
+    them: a wall across the whole table singles out no plane. Where there are none it is the middle
+    of starts and goals, which must be the same.
+    """
+    planes = _about_obstacles(task) if task.obstacles else _about_goals(task)
+    return tuple(mirror for mirror in planes if _symmetric(task.tube, mirror.axis))
+
+
+def _about_obstacles(task: Task) -> list[Mirror]:
+    def leave_a_way(axis: int) -> bool:
+        return any(box.half_size[axis] < TABLE_HALF_SIZE[axis] for box in task.obstacles)
+
+    return [
         mirror
         for mirror in _FETCH
-        if all(_symmetric(boxes, mirror.axis) for boxes in (task.obstacles, task.tube))
-    )
+        if _symmetric(task.obstacles, mirror.axis) and leave_a_way(mirror.axis)
+    ]
+
+
+def _about_goals(task: Task) -> list[Mirror]:
+    start, goal = _middle(task.start), _middle(task.goal)
+    return [
+        replace(mirror, at=round(float(goal[mirror.axis]), 4))
+        for mirror in _FETCH
+        if abs(start[mirror.axis] - goal[mirror.axis]) < _SAME_MIDDLE
+    ]
+
+
+def _middle(region: Region) -> np.ndarray:
+    middle: np.ndarray = reference_point(region, COMMON) + np.add(region.low, region.high) / 2
+    return middle
 
 
 def _symmetric(boxes: tuple[Box, ...], axis: int) -> bool:

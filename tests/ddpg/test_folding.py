@@ -82,19 +82,36 @@ def test_a_mirror_that_is_none_is_refused(fields: dict[str, Any], said: str) -> 
         Mirror(**fields)
 
 
-def test_obstacles_decide_which_planes_there_are() -> None:
-    axes = {name: [mirror.axis for mirror in fetch_mirrors(task)] for name, task in TASKS.items()}
-    across = {"PnPSimpleV1", "PnPSimpleV2", "PnPInsertion"}
-    assert axes == {name: [0, 1] if name in across else [0] for name in axes}
+def planes(task: Task) -> list[tuple[int, float]]:
+    return [(mirror.axis, mirror.at) for mirror in fetch_mirrors(task)]
+
+
+def test_goals_and_obstacles_decide_which_planes_there_are() -> None:
+    gripper, table = [(0, 1.3419), (1, 0.7491)], [(0, 1.3), (1, 0.75)]
+    assert {name: planes(task) for name, task in TASKS.items()} == {
+        "PnPSimpleV1": gripper,
+        "PnPSimpleV2": table,
+        "PnPInsertion": gripper,
+        "PushSideGap": table[:1],
+        "PushMiddleGap": table[:1],
+        "PushDoubleObstacles": table[:1],
+        "PnPObstacle": [],
+        "PnPShelf": [],
+    }
+
+
+def test_planes_of_a_task_of_ones_own() -> None:
     region = Region("table", (-0.1, -0.2), (0.1, -0.1))
     third = Box((0.1 + 0.2 - 0.15, 0.1, 0.25), (0.05, 0.01, 0.05))
     walls = (third, Box((-0.15, 0.1, 0.25), (0.05, 0.01, 0.05)))
     assert third.centre[0] != 0.15, "a rounding is no asymmetry"
-    assert [
-        mirror.axis for mirror in fetch_mirrors(Task("Rounded", region, region, obstacles=walls))
-    ] == [0]
+    assert planes(Task("Rounded", region, region, obstacles=walls)) == [(0, 1.3)]
     aside = Task("Aside", region, region, obstacles=(Box((0.05, 0.1, 0.25), (0.1, 0.01, 0.05)),))
-    assert fetch_mirrors(aside) == ()
+    assert planes(aside) == []
+    beyond = Region("table", (-0.1, 0.1), (0.1, 0.2))
+    assert planes(Task("Across", region, beyond)) == [(0, 1.3)], "goals lie on one side in y"
+    leaning = (Box((0.03, 0.0, 0.05), (0.01, 0.01, 0.05)),)
+    assert planes(Task("Leaning", region, region, tube=leaning)) == [(1, 0.6)]
 
 
 def _model(env: Any, **policy_kwargs: Any) -> HerDDPG:
@@ -213,7 +230,7 @@ def test_what_an_environment_holds_instead_is_said(held: Any) -> None:
 
 
 def test_policies_say_where_planes_do_not_fit(tmp_path: Path) -> None:
-    both = FetchVecEnv("FollowObject/PnPSimpleV1-v0", 1, seed=0)
+    both = FetchVecEnv("FollowObject/PnPSimpleV2-v0", 1, seed=0)
     one = FetchVecEnv("FollowObject/PushSideGap-v0", 1, seed=0)
     model = _model(both, mirrors="auto", net_arch=[8])
     with pytest.warns(UserWarning, match=r"across axis \[1\]"):
