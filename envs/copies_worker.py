@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from traceback import format_exc
 from typing import Any
 
 import cloudpickle
@@ -98,28 +99,35 @@ def serve(pipe: Connection) -> None:
     path, maker, n = pipe.recv()
     sys.path[:] = path
     copies = None
-    while True:
-        try:
-            if copies is None:
-                copies = Copies(cloudpickle.loads(maker), n)
-                answer: Any = None
-            else:
-                name, arguments = cloudpickle.loads(pipe.recv_bytes())
-                answer = getattr(copies, name)(*arguments)
-            pipe.send((None, answer))
-        except (EOFError, ConnectionError, KeyboardInterrupt):
-            break
-        except Exception as error:  # an environment of somebody's may raise anything
-            with suppress(OSError):
-                pipe.send((_told(error), None))
-            if copies is None:
+    try:
+        while True:
+            try:
+                if copies is None:
+                    copies = Copies(cloudpickle.loads(maker), n)
+                    answer: Any = None
+                else:
+                    name, arguments = cloudpickle.loads(pipe.recv_bytes())
+                    answer = getattr(copies, name)(*arguments)
+                pipe.send((None, answer))
+            except (EOFError, ConnectionError, KeyboardInterrupt):
                 break
+            except Exception as error:  # an environment of somebody's may raise anything
+                with suppress(OSError):
+                    pipe.send(((_told(error), format_exc()), None))
+                if copies is None:
+                    break
+    finally:
+        if copies is not None:
+            copies.close()
 
 
 def _told(error: Exception) -> Exception:
-    """An error as the other process can raise it."""
+    """An error as the other process can raise it: of its kind, if that is one of Python's."""
     kind = type(error)
-    return kind(str(error)) if kind.__module__ == "builtins" else RuntimeError(str(error))
+    with suppress(TypeError):  # some take more than a sentence
+        if kind.__module__ == "builtins":
+            return kind(str(error))
+    return RuntimeError(f"{kind.__name__}: {error}" if str(error) else kind.__name__)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection
 from socket import socketpair
@@ -82,10 +83,11 @@ def with_face(env: gym.Env) -> gym.Env:
 
 def _lacks_face(spec: EnvSpec, options: dict[str, Any]) -> bool:
     """Whether an environment with goals lacks what `RobotTask` adds, looked at once a process."""
-    key = registration_key(spec, options)
+    wrappers = tuple(wrapper.name for wrapper in spec.additional_wrappers)
+    key = registration_key(spec, options), wrappers
     if key not in _LACKING:
         try:
-            probe = gym.make(spec, **options)
+            probe = _probe(spec, options)
             try:
                 _LACKING[key] = may_be_faced(probe) and needs_face(probe)
             finally:
@@ -99,6 +101,16 @@ def _lacks_face(spec: EnvSpec, options: dict[str, Any]) -> bool:
 
 
 _LACKING: dict[Any, bool] = {}
+
+
+def _probe(spec: EnvSpec, options: dict[str, Any]) -> gym.Env:
+    """Make an environment anew, without the wrappers around it where they cannot be made anew."""
+    try:
+        return gym.make(spec, **options)
+    except ValueError:
+        if not spec.additional_wrappers:
+            raise
+        return gym.make(replace(spec, additional_wrappers=()), **options)
 
 
 def _faced(env: gym.Env) -> gym.Env:
@@ -145,13 +157,14 @@ class ProcessVecEnv(VecEnv):
             worker.answer()  # all are making theirs at once
         super().__init__(n_envs, self._judge.observation_space, self._judge.action_space)
         self.metadata = self._judge.metadata
+        self._judge.reset(seed=0)  # some judge by what a reset has made
 
     def reset(self) -> dict[str, np.ndarray]:
         """Begin an episode in every copy; seeds set by `seed()` count from here."""
         for worker, rows in zip(self._workers, self._rows, strict=True):
             seeds = [self._seeds[row] for row in rows]
             worker.ask("reset", seeds, [self._options[row] for row in rows])
-        answers = [worker.answer() for worker in self._workers]
+        answers = self._answers()
         self.reset_infos = [info for _, infos in answers for info in infos]
         self._reset_seeds()
         self._reset_options()
@@ -166,7 +179,7 @@ class ProcessVecEnv(VecEnv):
         self,
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Wait until all have stepped."""
-        answers = [worker.answer() for worker in self._workers]
+        answers = self._answers()
         obs, rewards, dones, infos, begun = zip(*answers, strict=True)
         for rows, news in zip(self._rows, begun, strict=True):
             for index, info in news.items():
@@ -186,7 +199,7 @@ class ProcessVecEnv(VecEnv):
         """A picture of every copy."""
         for worker in self._workers:
             worker.ask("render")
-        return [image for worker in self._workers for image in worker.answer()]
+        return [image for images in self._answers() for image in images]
 
     def has_attr(self, attr_name: str) -> bool:
         """Whether the copies have an attribute."""
@@ -211,6 +224,8 @@ class ProcessVecEnv(VecEnv):
         if method_name in _JUDGES:
             judge = self._judge.get_wrapper_attr(method_name)
             return [judge(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
+        if indices is None:  # it may change what the judge goes by
+            self._judge.get_wrapper_attr(method_name)(*method_args, **method_kwargs)
         return self._each(indices, "method", method_name, method_args, method_kwargs)
 
     def apply(self, function: Callable[[gym.Env], Any], rows: Iterable[int]) -> list[Any]:
@@ -225,6 +240,18 @@ class ProcessVecEnv(VecEnv):
         raise ValueError(
             "environments in processes cannot be copied; make them again, or take n_threads=1"
         )
+
+    def _answers(self) -> list[Any]:
+        """What every process has to say; what went wrong in one is raised once all have spoken."""
+        answers, errors = [], []
+        for worker in self._workers:
+            try:
+                answers.append(worker.answer())
+            except Exception as error:  # an environment of somebody's may raise anything
+                errors.append(error)
+        if errors:
+            raise errors[0]
+        return answers
 
     def _each(self, indices: Any, name: str, *arguments: Any) -> list[Any]:
         answers = []
@@ -274,7 +301,8 @@ class _Worker:
                 f"a process of the robot's environment has ended by itself (status {code})"
             ) from ended
         if error is not None:
-            raise error
+            raised, traceback = error
+            raise raised from RuntimeError(f"in a process of the robot's environment\n{traceback}")
         return answer
 
     def close(self) -> None:

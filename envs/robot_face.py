@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import gymnasium as gym
@@ -17,6 +17,7 @@ Judge = Callable[..., Any]
 GoalOf = Callable[[gym.Env, Any], tuple[Any, Any]]
 EffectorOf = Callable[[gym.Env], Any]
 
+_GOALS = ("achieved_goal", "desired_goal")
 _FAR = 10.0  # metres, farther than any goal is reached from
 
 
@@ -64,13 +65,13 @@ class RobotTask(gym.Wrapper):
         self._judge: Judge | None = None
         self._batches = False
         if goal is not None:
-            self.observation_space = _goal_space(env.observation_space)
-        elif missing_goal_keys(env.observation_space):  # a name is kept once it has been asked for
+            self.observation_space = _goal_space(env)
+        elif missing_goal_keys(env.observation_space):
             check_goal_keys(env.observation_space, _name(env))
         if effector is not None:
-            n = spaces.flatdim(cast(spaces.Dict, self.observation_space)["observation"])
-            self.told_effector = n, n + 1, n + 2
-            self.observation_space = _with_effector(self.observation_space)
+            self.observation_space = _with_effector(self.observation_space, env)
+            n = spaces.flatdim(self.observation_space["observation"])
+            self.told_effector = n - 3, n - 2, n - 1
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -101,7 +102,8 @@ class RobotTask(gym.Wrapper):
                 f"effector= must return a position of the shape (3,), not {place.shape}"
             )
         told = np.concatenate([shown["observation"], place])
-        return {**shown, "observation": told.astype(shown["observation"].dtype)}
+        kind = cast(spaces.Dict, self.observation_space)["observation"].dtype
+        return {**shown, "observation": told.astype(kind)}
 
     def _with_goals(self, obs: Any, goal: GoalOf) -> dict[str, np.ndarray]:
         goals = goal(self.env.unwrapped, obs)
@@ -113,7 +115,7 @@ class RobotTask(gym.Wrapper):
                 )
         achieved, desired = (np.array(each, dtype=np.float64) for each in goals)
         return {
-            "observation": np.concatenate(_parts(obs)),
+            "observation": np.concatenate(_parts(_without_goals(obs))),
             "achieved_goal": achieved,
             "desired_goal": desired,
         }
@@ -142,7 +144,7 @@ class RobotTask(gym.Wrapper):
         """Find who says whether goals are reached, and whether of many at once."""
         judge = self._given or _success_method(self.env)
         pays = None
-        if _has(self.env, "compute_reward") and self._goal is None:
+        if _has(self.env, "compute_reward") and self._goal is None and self._given is None:
             pays = rewards_on_and_off(self.env, desired)
             self.shifted = pays == (1.0, 0.0)
             if pays != (0.0, -1.0) and not self.shifted:
@@ -151,9 +153,10 @@ class RobotTask(gym.Wrapper):
                     "the rewards must be 0 and -1, or 1 and 0"
                 )
         if judge is None and pays is None:
+            where = "is_success" if self._goal is not None else "compute_reward or is_success"
             raise ValueError(
-                f"{_name(self.env)} does not tell when a goal is reached, by compute_reward or "
-                "is_success; say it with is_success="
+                f"{_name(self.env)} does not tell when a goal is reached, by {where}; say it with "
+                "is_success="
             )
         if judge is None:
             judge = self._pays_most
@@ -217,23 +220,54 @@ def _answers_batches(judge: Judge, desired: np.ndarray) -> bool:
     return bool(np.allclose(told.astype(float), alone, atol=1e-6))
 
 
-def _goal_space(space: spaces.Space) -> spaces.Dict:
-    """The space of observations with goals that are positions."""
-    size = sum(part.size for part in _parts(space.sample()))
+def _goal_space(env: gym.Env) -> spaces.Dict:
+    """The space of an environment's observations with goals that are positions."""
+    space = env.observation_space
+    shown = _without_goals(space.spaces if isinstance(space, spaces.Dict) else space)
+    _check_parts(shown, env)
+    size = sum(part.size for part in _parts(_sample(shown)))
     sizes = {"observation": size, "achieved_goal": POSITIONS.size, "desired_goal": POSITIONS.size}
     return spaces.Dict(
         {key: spaces.Box(-np.inf, np.inf, (n,), np.float64) for key, n in sizes.items()}
     )
 
 
-def _with_effector(space: spaces.Space) -> spaces.Dict:
+def _with_effector(space: spaces.Space, env: gym.Env) -> spaces.Dict:
     """The space of observations that end with a position."""
     keys = dict(cast(spaces.Dict, space).spaces)
-    box = cast(spaces.Box, keys["observation"])
-    kind: Any = box.dtype
+    box = keys["observation"]
+    if not isinstance(box, spaces.Box) or len(box.shape) != 1:
+        raise ValueError(f"{_name(env)}: effector= needs observations that are a row of numbers")
+    kind: Any = np.result_type(box.dtype, np.float32)
     anywhere = np.full(POSITIONS.size, np.inf, dtype=kind)
     low, high = np.append(box.low, -anywhere), np.append(box.high, anywhere)
     return spaces.Dict({**keys, "observation": spaces.Box(low, high, dtype=kind)})
+
+
+def _without_goals(held: Any) -> Any:
+    """What an observation, or its space, holds besides goals that `goal=` says otherwise."""
+    if not isinstance(held, Mapping):
+        return held
+    return {name: value for name, value in held.items() if name not in _GOALS}
+
+
+def _check_parts(space: Any, env: gym.Env, at: str = "") -> None:
+    """Raise a ValueError where an observation holds what is no number of a measure."""
+    if isinstance(space, Mapping):
+        for key, part in space.items():
+            _check_parts(part, env, f" at {key!r}")
+    elif not isinstance(space, spaces.Box) or (space.dtype == np.uint8 and len(space.shape) > 1):
+        kind = "pictures" if isinstance(space, spaces.Box) else f"a {type(space).__name__}"
+        raise ValueError(
+            f"{_name(env)}: its observations hold {kind}{at}, which cannot be put in a row with others' "
+            "numbers; leave that out, or say it as numbers in a Box"
+        )
+
+
+def _sample(space: Any) -> Any:
+    if isinstance(space, Mapping):
+        return {name: _sample(part) for name, part in space.items()}
+    return space.sample()
 
 
 def _parts(obs: Any) -> list[np.ndarray]:
@@ -244,4 +278,5 @@ def _parts(obs: Any) -> list[np.ndarray]:
 
 
 def _name(env: gym.Env) -> str:
+    """An environment's name for errors alone: its wrappers keep it once it has been asked for."""
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__

@@ -16,6 +16,7 @@ _FETCH = (
     Mirror(0, COMMON.table[0], (0, 3), (6, 12, 13, 14, 18, 19, 20), (), (0,)),
     Mirror(1, COMMON.table[1], (1, 4), (7, 11, 13, 15, 17, 19, 21), ((9, 10), (23, 24)), (1,)),
 )
+_SAME_PLACE = 1e-6  # metres
 _SAME_MIDDLE = 0.01  # metres between the middles of starts and of goals
 
 
@@ -31,14 +32,32 @@ def fetch_mirrors(task: Task) -> tuple[Mirror, ...]:
 
 
 def _about_obstacles(task: Task) -> list[Mirror]:
-    def leave_a_way(axis: int) -> bool:
-        return any(box.half_size[axis] < TABLE_HALF_SIZE[axis] for box in task.obstacles)
-
     return [
         mirror
         for mirror in _FETCH
-        if _symmetric(task.obstacles, mirror.axis) and leave_a_way(mirror.axis)
+        if _symmetric(task.obstacles, mirror.axis) and _leave_a_way(task.obstacles, mirror.axis)
     ]
+
+
+def _leave_a_way(boxes: tuple[Box, ...], axis: int) -> bool:
+    """Whether some box, with those that it is in line with along an axis, is no wall across it."""
+    lines: dict[tuple[float, ...], list[tuple[float, float]]] = {}
+    for box in boxes:
+        others = [i for i in range(3) if i != axis]
+        line = tuple(round(of[i], 6) for of in (box.centre, box.half_size) for i in others)
+        middle, half = box.centre[axis], box.half_size[axis]
+        lines.setdefault(line, []).append((middle - half, middle + half))
+    return any(not _cover(spans, TABLE_HALF_SIZE[axis]) for spans in lines.values())
+
+
+def _cover(spans: list[tuple[float, float]], half: float) -> bool:
+    """Whether spans leave nothing of what lies within half a size of the middle."""
+    end = -half
+    for low, high in sorted(spans):
+        if low > end + _SAME_PLACE:
+            return False
+        end = max(end, high)
+    return end >= half - _SAME_PLACE
 
 
 def _about_goals(task: Task) -> list[Mirror]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..envs.physics_engine import mujoco
 from ..envs.robot_parts import body_name, rigid_group, robot_bodies, touching_geoms
-from .physics_access import physics_of
+from .physics_access import physics_of, placed
 from .resets import Resets
 
 # Position in metres, then the directions of the body's x and y axis.
@@ -85,10 +85,7 @@ def read_context(names: Sequence[str], env: gym.Env) -> np.ndarray:
         return np.zeros(0)
     model, data = physics_of(env)
     bodies, numbers = located(names, model)
-    now = mujoco.MjData(model)  # places of bodies are stale in `data` where they were moved
-    now.qpos[:] = data.qpos
-    now.mocap_pos[:], now.mocap_quat[:] = data.mocap_pos, data.mocap_quat
-    mujoco.mj_kinematics(model, now)
+    now = placed(model, data)
     read: np.ndarray = place_numbers(now.xpos, now.xquat)[bodies, numbers]
     return read
 

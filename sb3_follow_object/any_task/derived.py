@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
 from ..common.cache import SET_THE_VARIABLE, cache_folder
 from ..common.files import lock
@@ -33,6 +34,7 @@ _LONG, _LONG_T = 100, 50  # episodes of more steps than this have an object whos
 _FILE = "resets.safetensors"
 _FARTHEST = 0.5  # metres at which no goal is reached any more
 _HALVINGS = 16
+_ROUNDS = 3  # over an object's joints, each of which is moved as near to the goal as it can be
 _TRIED = 201  # positions of a drawer or a door, to find the one at the goal
 
 
@@ -128,6 +130,10 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
         raise ValueError(
             f"there are no goals: its observations lack {', '.join(missing)}; {SAY_GOALS}"
         )
+    if not isinstance(env.action_space, spaces.Box):
+        raise ValueError(
+            f"its actions are {env.action_space}; the robot is trained with actions in a Box"
+        )
     horizon = _horizon(env)
     followed_space(env.observation_space["desired_goal"].shape)  # type: ignore[index]
     few, model, data = record_resets(env, _FEW)
@@ -146,7 +152,8 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
             "time limit: turn that off in the environment"
         )
     within = success_distance(env, few.goals[:5])
-    drawn = _drawn(env_id, env, few, horizon, within)
+    others = [b for b in varying_bodies(model, few) if b != found.body]
+    drawn = _drawn(env_id, env, few, others, horizon, within)
     physics = physics_digest_of(model, found.body, found.offset, few, drawn)
     resets = _kept_resets(env_id, env, physics, report)
     task = DerivedTask(env_id, object_horizon(horizon), physics)
@@ -200,24 +207,35 @@ def ends_at_goal(env: gym.Env, found: Candidate) -> bool:
     obs, _ = env.reset(seed=0)
     model, data = physics_of(env)
     goal = np.array(obs["desired_goal"], np.float64)
-    joint = int(model.body_jntadr[found.body])
-    place = int(model.jnt_qposadr[joint])
-    if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):
+    first = int(model.body_jntadr[found.body])
+    joints = range(first, first + int(model.body_jntnum[found.body]))
+    if int(model.jnt_type[first]) == int(mujoco.mjtJoint.mjJNT_FREE):
+        place = int(model.jnt_qposadr[first])
         data.qpos[place : place + 3] += goal - obs["achieved_goal"]
     else:
-        low, high = data.qpos[place] + np.array([-_FARTHEST, _FARTHEST])
-        if model.jnt_limited[joint]:
-            low, high = model.jnt_range[joint]
-
-        def off(position: float) -> float:
-            data.qpos[place] = position
-            mujoco.mj_kinematics(model, data)
-            frame = data.xmat[found.body].reshape(3, 3)
-            return float(np.linalg.norm(data.xpos[found.body] + frame @ found.offset - goal))
-
-        data.qpos[place] = min(np.linspace(low, high, _TRIED), key=off)
+        for joint in [*joints] * _ROUNDS:
+            if int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_BALL):
+                _bring(model, data, joint, found, goal)
     mujoco.mj_forward(model, data)
     return bool(env.step(np.zeros_like(env.action_space.sample()))[2])
+
+
+def _bring(
+    model: mujoco.MjModel, data: mujoco.MjData, joint: int, found: Candidate, goal: np.ndarray
+) -> None:
+    """Move one of an object's joints to where the object is nearest to a goal (3,)."""
+    place = int(model.jnt_qposadr[joint])
+    low, high = data.qpos[place] + np.array([-_FARTHEST, _FARTHEST])
+    if model.jnt_limited[joint]:
+        low, high = model.jnt_range[joint]
+
+    def off(position: float) -> float:
+        data.qpos[place] = position
+        mujoco.mj_kinematics(model, data)
+        frame = data.xmat[found.body].reshape(3, 3)
+        return float(np.linalg.norm(data.xpos[found.body] + frame @ found.offset - goal))
+
+    data.qpos[place] = min(np.linspace(low, high, _TRIED), key=off)
 
 
 def _horizon(env: gym.Env) -> int:
@@ -248,12 +266,18 @@ def _second(seen: Observed, found: Candidate) -> float | None:
     return next(others, None)
 
 
-def _drawn(env_id: str, env: gym.Env, few: Resets, horizon: int, within: float) -> str:
-    """What decides how episodes are drawn: the first ones, where seeds say them again."""
+def _drawn(
+    env_id: str, env: gym.Env, few: Resets, others: list[int], horizon: int, within: float
+) -> str:
+    """What decides how episodes are drawn: of the first ones what seeds say again."""
     again, _, _ = record_resets(env, 2)
-    repeats = np.array_equal(again.goals, few.goals[:2])
-    episodes = np.concatenate([few.goals, few.starts]).round(5).tolist() if repeats else ""
-    return f"{env_id} {horizon} {within} {mujoco.__version__.split('.')[0]} {episodes}"
+    arrays = [(few.goals, again.goals), (few.starts, again.starts)]
+    arrays += [(few.places[:, body], again.places[:, body]) for body in sorted(others)]
+    episodes: list[Any] = []
+    for drawn, redrawn in arrays:
+        if np.array_equal(drawn[:2], redrawn):
+            episodes += drawn.round(5).tolist()
+    return f"{env_id} {horizon} {within} {mujoco.__version__.split('.')[0]} {episodes or ''}"
 
 
 def _kept_resets(env_id: str, env: gym.Env, physics: str, report: Report) -> Resets:

@@ -9,13 +9,14 @@ import numpy as np
 
 from ..envs.physics_engine import mujoco
 from ..envs.robot_parts import carrier, robot_bodies, touching_geoms
-from .physics_access import physics_of
+from .physics_access import physics_of, placed
 
 
 def fingertips(env: gym.Env) -> np.ndarray:
     """The middle of a robot's fingertips, (3,) metres, read from its simulation.
 
-    For `effector=`, where an environment's observation does not hold it.
+    For `effector=`, where an environment's observation does not hold it. Fingertips are the ends of
+    what has the most joints above it: of two fingers that move both, of one that moves its own.
 
     Args:
         env: runs a MuJoCo simulation with a robot, which is what actuators drive.
@@ -24,13 +25,16 @@ def fingertips(env: gym.Env) -> np.ndarray:
         ValueError: there is no simulation, or no robot in it.
     """
     model, data = physics_of(env)
-    known = _TIPS.get(env)
+    known = _KNOWN.get(env)
     if known is None or known[0] is not model:  # some environments make another at a reset
-        known = _TIPS[env] = model, Fingertips(model)
-    return known[1].middle(data.xpos, data.xmat.reshape(-1, 3, 3))
+        known = _KNOWN[env] = model, Fingertips(model), mujoco.MjData(model)
+    _, tips, scratch = known
+    now = placed(model, data, scratch)
+    return tips.middle(now.xpos, now.xmat.reshape(-1, 3, 3))
 
 
-_TIPS: WeakKeyDictionary[gym.Env, tuple[mujoco.MjModel, Fingertips]] = WeakKeyDictionary()
+_Known = tuple[mujoco.MjModel, "Fingertips", mujoco.MjData]
+_KNOWN: WeakKeyDictionary[gym.Env, _Known] = WeakKeyDictionary()
 
 
 class Fingertips:

@@ -10,7 +10,7 @@ import numpy as np
 from ..envs.physics_engine import mujoco
 from ..envs.robot_parts import body_name, carrier, robot_bodies
 from .effectors import Fingertips
-from .physics_access import physics_of
+from .physics_access import physics_of, placed
 
 N_RESETS, N_STEPS = 20, 30  # watched, the steps after one reset at random
 TOLERANCE = 1e-3  # metres that a body's fixed point may lie off the achieved goal
@@ -60,6 +60,8 @@ class Observed:
         observations: (n, size).
         positions: of bodies, (n, nbody, 3) metres.
         rotations: of bodies, (n, nbody, 3, 3).
+        later: the same, (n, nbody, 12), once bodies are where the joints say: after a step MuJoCo
+            has them where they were before its last one.
         sites: positions of sites, (n, nsite, 3) metres.
         terminated: whether an episode ended before its time.
         model: the last reset's.
@@ -70,6 +72,7 @@ class Observed:
     observations: np.ndarray
     positions: np.ndarray
     rotations: np.ndarray
+    later: np.ndarray
     sites: np.ndarray
     terminated: bool
     model: mujoco.MjModel
@@ -93,11 +96,13 @@ def observe(env: gym.Env, n_resets: int = N_RESETS, n_steps: int = N_STEPS) -> O
     terminated = False
 
     def keep(obs: dict[str, np.ndarray]) -> None:
-        _, data = physics_of(env)
+        model, data = physics_of(env)
+        now = placed(model, data)
         goals = (np.array(obs[key], np.float64) for key in ("achieved_goal", "desired_goal"))
         seen = np.array(obs["observation"], np.float64).ravel()
         frames = data.xmat.reshape(-1, 3, 3).copy()
-        rows.append((*goals, seen, data.xpos.copy(), frames, data.site_xpos.copy()))
+        later = np.concatenate([now.xpos, now.xmat], axis=1)
+        rows.append((*goals, seen, data.xpos.copy(), frames, later, data.site_xpos.copy()))
 
     for seed in range(n_resets):
         obs, _ = env.reset(seed=seed)
@@ -112,10 +117,10 @@ def observe(env: gym.Env, n_resets: int = N_RESETS, n_steps: int = N_STEPS) -> O
         env.reset(seed=0)
         _nudge(*physics_of(env), root)
         keep(env.step(np.zeros_like(env.action_space.sample()))[0])
-    achieved, desired, told, positions, rotations, sites = map(np.stack, zip(*rows, strict=True))
-    return Observed(
-        achieved, desired, told, positions, rotations, sites, terminated, physics_of(env)[0]
-    )
+    columns = [np.stack(column) for column in zip(*rows, strict=True)]
+    achieved, desired, told, positions, rotations, later, sites = columns
+    model = physics_of(env)[0]
+    return Observed(achieved, desired, told, positions, rotations, later, sites, terminated, model)
 
 
 def candidates(seen: Observed) -> list[Candidate]:
@@ -223,11 +228,18 @@ def _nudge(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> None:
 
 def _fixed_point(seen: Observed, body: int) -> tuple[np.ndarray, float]:
     """The point of a body's frame that is nearest to the achieved goals, and its largest error."""
-    position, rotation = seen.positions[:, body], seen.rotations[:, body]
-    local = np.einsum("nji,nj->ni", rotation, seen.achieved - position)
-    offset = local.mean(axis=0)
-    error = np.linalg.norm(local - offset, axis=1).max()
-    return offset, float(error)
+    position, turn = np.split(seen.later[:, body], [3], axis=1)
+
+    def fixed(position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, float]:
+        local = np.einsum("nji,nj->ni", rotation, seen.achieved - position)
+        offset = local.mean(axis=0)
+        return offset, float(np.linalg.norm(local - offset, axis=1).max())
+
+    return min(
+        fixed(seen.positions[:, body], seen.rotations[:, body]),
+        fixed(position, turn.reshape(-1, 3, 3)),
+        key=lambda found: found[1],
+    )
 
 
 def _named(seen: Observed, found: list[Candidate], wanted: str) -> Candidate:

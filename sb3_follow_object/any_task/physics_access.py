@@ -53,6 +53,23 @@ def physics_of(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData]:
     )
 
 
+def placed(
+    model: mujoco.MjModel, data: mujoco.MjData, into: mujoco.MjData | None = None
+) -> mujoco.MjData:
+    """Return a state with bodies where its joints say, as `data` may not have them yet.
+
+    Args:
+        model: compiled.
+        data: a state of it, which stays as it is.
+        into: is written to and returned; None makes a new one.
+    """
+    now = mujoco.MjData(model) if into is None else into
+    now.qpos[:] = data.qpos
+    now.mocap_pos[:], now.mocap_quat[:] = data.mocap_pos, data.mocap_quat
+    mujoco.mj_kinematics(model, now)
+    return now
+
+
 def _attributes(thing: Any) -> Iterator[Any]:
     """What an object holds, likely places first; containers of plain values are not searched."""
     held = getattr(thing, "__dict__", None)

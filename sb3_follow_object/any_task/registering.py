@@ -6,14 +6,16 @@ import itertools
 import re
 from collections.abc import Callable
 from functools import partial
-from types import FunctionType
+from types import CodeType, FunctionType
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from ..envs.goal_envs import SAY_LENGTH
-from ..envs.registration import import_task
+from ..envs.registration import import_robotics, import_task
 from ..envs.robot_face import EffectorOf, GoalOf, Judge, RobotTask
+from ..envs.robotics import is_of_robotics
 
 MakeEnv = Callable[[], gym.Env]
 NAMESPACE = "Followed"
@@ -61,7 +63,7 @@ def registered(
         name = import_task(env_id)
         if name not in gym.registry:
             raise ValueError(f"there is no environment {env_id!r}")
-        make_env = partial(gym.make, name)
+        make_env = partial(_make_registered, gym.spec(name))
         title, _, version = name.rpartition("/")[2].rpartition("-v")
     else:
         title = getattr(make_env, "__name__", type(make_env).__name__)
@@ -78,6 +80,8 @@ def registered(
     return ours
 
 
+# What of compiled code is in its words, and not in the lines that they stand on.
+_WORDS = tuple(f"co_{name}" for name in ("code", "consts", "names", "varnames", "freevars"))
 _GIVEN: dict[str, tuple[Any, ...]] = {}  # what each id was registered with
 
 
@@ -115,6 +119,8 @@ def _same(one: Any, other: Any) -> bool:
         )
     if isinstance(one, FunctionType):
         return one.__globals__ is other.__globals__ and _same(_written(one), _written(other))
+    if isinstance(one, CodeType):
+        return all(_same(getattr(one, name), getattr(other, name)) for name in _WORDS)
     return bool(one == other)
 
 
@@ -123,6 +129,13 @@ def _written(function: FunctionType) -> tuple[Any, ...]:
     cells = tuple(cell.cell_contents for cell in function.__closure__ or ())
     named = tuple((function.__kwdefaults__ or {}).items())
     return function.__code__, function.__defaults__, named, cells
+
+
+def _make_registered(spec: EnvSpec, **options: Any) -> gym.Env:
+    """Make an environment of gymnasium's, also in a process that has not registered it."""
+    if is_of_robotics(spec):
+        import_robotics()  # quietly
+    return gym.make(spec, **options)
 
 
 def _horizon(make_env: MakeEnv, name: str) -> int:
@@ -147,7 +160,8 @@ def _make(
     render_mode: str | None = None,
     **options: Any,
 ) -> gym.Env:
-    if render_mode is not None and isinstance(make_env, partial):  # gymnasium's own make
+    by_id = isinstance(make_env, partial) and make_env.func is _make_registered
+    if render_mode is not None and by_id:
         options = {**options, "render_mode": render_mode}
     env = make_env(**options)
     if goal is None and is_success is None and effector is None:

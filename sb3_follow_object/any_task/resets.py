@@ -13,7 +13,7 @@ import numpy as np
 from ..common.array_trees import load_tree, save_tree
 from ..envs.goal_space import goal_space
 from ..envs.physics_engine import mujoco
-from ..envs.robot_parts import robot_bodies, standing
+from ..envs.robot_parts import body_name, robot_bodies, standing, touching_geoms
 from .physics_access import physics_of
 
 SURFACE_SHARE, SURFACE_HEIGHT = 0.99, 0.012  # share of the goals, metres off the start's height
@@ -75,6 +75,10 @@ def record_resets(
 
     Returns:
         The resets, and a copy of the first one's model and data.
+
+    Raises:
+        ValueError: what can be touched is moved or reshaped between episodes in a way that no body
+            tells of.
     """
     rows: list[tuple[np.ndarray, ...]] = []
     first: tuple[mujoco.MjModel, mujoco.MjData] | None = None
@@ -82,6 +86,9 @@ def record_resets(
         obs, _ = env.reset(seed=seed)
         model, data = physics_of(env)
         mujoco.mj_kinematics(model, data)  # places of bodies are stale where they were moved
+        if first is None:
+            first = copy.copy(model), copy.copy(data)
+        check_same_shapes(first[0], model)
         rows.append(
             (
                 np.array(obs["desired_goal"], np.float64),
@@ -91,11 +98,35 @@ def record_resets(
                 np.concatenate([data.xpos, data.xquat], axis=1),
             )
         )
-        if first is None:
-            first = copy.copy(model), copy.copy(data)
         begun(seed + 1)
     assert first is not None
     return Resets(*(np.stack(column) for column in zip(*rows, strict=True))), *first
+
+
+def check_same_shapes(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
+    """Raise a ValueError where an episode's model has other shapes than the first one's.
+
+    The object's scene is made of the first. What stands elsewhere in it are bodies; the robot may
+    change as it likes, and so may what touches nothing.
+    """
+    if (first.nbody, first.ngeom, first.nq) != (model.nbody, model.ngeom, model.nq):
+        raise ValueError(
+            "its model has other bodies, geoms or joints in other episodes; the object's scene "
+            "needs the same in all: move what is not wanted out of the way"
+        )
+    matter = touching_geoms(first) & ~robot_bodies(first)[first.geom_bodyid]
+    for what, name in _SHAPES.items():
+        differ = np.abs(getattr(first, name) - getattr(model, name)).max(axis=1) > _SAME
+        for geom in map(int, np.flatnonzero(matter & differ)):
+            of = body_name(first, int(first.geom_bodyid[geom]))
+            raise ValueError(
+                f"geom {first.geom(geom).name or geom} of body {of} has another {what} in other "
+                "episodes, which the object's scene cannot follow; give it a body of its own, and "
+                "move that"
+            )
+
+
+_SHAPES = {"place": "geom_pos", "turn": "geom_quat", "size": "geom_size"}
 
 
 def varying_bodies(model: mujoco.MjModel, resets: Resets) -> frozenset[int]:

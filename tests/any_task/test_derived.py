@@ -11,6 +11,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from scenes import KITCHEN
 from test_finding import Kitchen
 
 from sb3_follow_object.any_task import derived as module
@@ -113,7 +114,70 @@ class EndsOpen(EndsThere):
         return self._observation(), {}
 
 
+class MovedGeom(Tidy):
+    """Its shelf is moved as a geom, not as a body."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        found = super().reset(seed=seed)
+        shelf = self.model.body("shelf").geomadr[0]
+        self.model.geom_pos[shelf, 0] = self.np_random.uniform(-0.1, 0.1)
+        return found
+
+
+class Rebuilt(Tidy):
+    """Has one body more in every other episode."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        spec = mujoco.MjSpec.from_string(KITCHEN)
+        if seed and seed % 2:
+            spec.worldbody.add_body(name="guest")
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        return super().reset(seed=seed)
+
+
+class Buttons(Tidy):
+    """Is played with buttons."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.action_space = gym.spaces.Discrete(3)  # type: ignore[assignment]
+
+
+PUCK = """
+<mujoco>
+  <worldbody>
+    <body name="finger" pos="0 0 0.3">
+      <joint name="turn" axis="0 0 1"/><geom size="0.02" mass="0.1"/><site name="tip"/>
+    </body>
+    <body name="puck">
+      <joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+      <geom size="0.02" mass="0.1"/>
+    </body>
+  </worldbody>
+  <actuator><position joint="turn"/></actuator>
+</mujoco>
+"""
+
+
+class EndsOnSlides(EndsThere):
+    """A puck on two slides; its goals are both ways off."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model = mujoco.MjModel.from_xml_string(PUCK)
+        self.data, self.body = mujoco.MjData(self.model), "puck"
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
+        self.goal = np.append(self.np_random.uniform(0.1, 0.3, 2), 0.0)
+        return self._observation(), {}
+
+
 KINDS = (Tidy, Lifting, Massless, Dense, Posed, NoPhysics, EndsThere, EndsOpen)
+KINDS += (MovedGeom, Rebuilt, Buttons, EndsOnSlides)
 for kind in KINDS:
     gym.register(f"{kind.__name__}-v0", kind, max_episode_steps=40, disable_env_checker=True)
 gym.register("Timeless-v0", Tidy, disable_env_checker=True)
@@ -237,6 +301,45 @@ def test_recorded_resets_are_kept_for_the_same_physics(monkeypatch: pytest.Monke
     assert len(said) == 2 and other.physics != first.physics
 
 
+def test_recorded_resets_are_those_of_what_stands_elsewhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first = derived("Tidy-v0")
+    reset = Tidy.reset
+
+    def farther(env: Any, *, seed: int | None = None, options: Any = None) -> Any:
+        reset(env, seed=seed)
+        env.model.body("shelf").pos[0] += 0.2  # starts and goals are the same
+        mujoco.mj_forward(env.model, env.data)
+        return env._observation(), {}
+
+    monkeypatch.setattr(Tidy, "reset", farther)
+    module._LOOKED_AT.clear()
+    other = derived("Tidy-v0")
+    assert other.physics != first.physics
+    shelf = int(Kitchen().model.body("shelf").id)
+    moved = other.resets.places[:, shelf, 0] - first.resets.places[:, shelf, 0]
+    np.testing.assert_allclose(moved, 0.2, atol=1e-9)
+
+
+def test_what_no_seed_says_again_is_no_part_of_the_physics(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng()
+
+    def unseeded(env: Any, *, seed: int | None = None, options: Any = None) -> Any:
+        Kitchen.reset(env)  # the mug lies where no seed says
+        env.data.joint(2).qpos[0] += rng.uniform(0.0, 0.01)
+        mujoco.mj_forward(env.model, env.data)
+        env.goal = np.array([0.5, 0.0, 0.23])
+        return env._observation(), {}
+
+    monkeypatch.setattr(Tidy, "reset", unseeded)
+    digests = set()
+    for _ in range(2):
+        module._LOOKED_AT.clear()
+        digests.add(derived("Tidy-v0").physics)
+    assert len(digests) == 1
+
+
 @pytest.mark.parametrize(
     ("env_id", "sentence"),
     [
@@ -248,6 +351,13 @@ def test_recorded_resets_are_kept_for_the_same_physics(monkeypatch: pytest.Monke
         ),
         ("EndsThere-v0", "'EndsThere-v0': it ends its episodes at the goal; imagined goals need"),
         ("EndsOpen-v0", "'EndsOpen-v0': it ends its episodes at the goal; imagined goals need"),
+        ("EndsOnSlides-v0", "'EndsOnSlides-v0': it ends its episodes at the goal; imagined"),
+        (
+            "MovedGeom-v0",
+            r"'MovedGeom-v0': geom \d+ of body shelf has another place in other .* give it a body",
+        ),
+        ("Rebuilt-v0", "'Rebuilt-v0': its model has other bodies, geoms or joints in other epis"),
+        ("Buttons-v0", r"'Buttons-v0': its actions are Discrete\(3\); the robot is trained with"),
         ("NoPhysics-v0", "'NoPhysics-v0': NoPhysics holds no MuJoCo simulation"),
         ("Timeless-v0", "'Timeless-v0': it does not say how long its episodes are; register it"),
         ("CartPole-v1", "'CartPole-v1': it has neither goals nor a MuJoCo simulation"),

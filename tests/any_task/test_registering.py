@@ -11,9 +11,10 @@ import pytest
 import toy
 from gymnasium.wrappers import TimeLimit
 
+from sb3_follow_object import fingertips
 from sb3_follow_object.any_task import registering
 from sb3_follow_object.any_task.registering import registered
-from sb3_follow_object.envs.robot_copies import robot_maker
+from sb3_follow_object.envs.robot_copies import ProcessVecEnv, robot_maker, robot_vec_env
 
 
 @pytest.fixture(autouse=True)
@@ -48,6 +49,7 @@ def test_goals_of_an_id_are_what_the_functions_say() -> None:
     env = robot_maker(env_id)()
     obs, _ = env.reset(seed=0)
     assert obs["desired_goal"][2] == pytest.approx(0.125)
+    assert obs["observation"].shape == (21,), "without the goals that it had before"
     assert env.get_wrapper_attr("is_success")(obs["desired_goal"], obs["desired_goal"])
     assert env.step(np.zeros(3))[1] == -1.0
     env.close()
@@ -89,6 +91,17 @@ def test_an_effector_is_told_at_the_observations_end() -> None:
     env.close()
 
 
+@pytest.mark.parametrize("env_id", [arm_and_wall.ARM, "FetchPush-v4"])
+def test_an_id_with_functions_is_known_in_other_processes(
+    env_id: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    env = robot_vec_env(registered(env_id, effector=fingertips), 4, 2)
+    assert isinstance(env, ProcessVecEnv)
+    env.reset()
+    env.close()
+    assert capfd.readouterr() == ("", "")
+
+
 def test_an_id_alone_stays_what_it_is() -> None:
     assert registered("FetchPush-v4") == "FetchPush-v4"
 
@@ -117,6 +130,13 @@ def test_the_same_functions_have_one_id_and_others_another() -> None:
 
     first = registered(make_env=made(50))
     assert registered(make_env=made(50)) == first, "written anew in the same words"
+    words = "def make():\n    return TimeLimit(Arm(), 50)\n"
+    names = {"TimeLimit": TimeLimit, "Arm": arm_and_wall.ArmAndWall}
+    cells = []
+    for text in (words, "# A comment more.\n" + words, words.replace("50", "51")):
+        exec(text, names)
+        cells.append(registered(make_env=names["make"]))
+    assert cells[0] == cells[1] != cells[2]
     other = registered(make_env=made(60))
     assert other != first
     assert gym.spec(first).max_episode_steps == 50 and gym.spec(other).max_episode_steps == 60

@@ -108,6 +108,10 @@ def test_planes_of_a_task_of_ones_own() -> None:
     assert planes(Task("Rounded", region, region, obstacles=walls)) == [(0, 1.3)]
     aside = Task("Aside", region, region, obstacles=(Box((0.05, 0.1, 0.25), (0.1, 0.01, 0.05)),))
     assert planes(aside) == []
+    halves = tuple(Box((x, 0.1, 0.25), (0.125, 0.01, 0.05)) for x in (-0.125, 0.125))
+    assert planes(Task("Halves", region, region, obstacles=halves)) == [], "a wall across all"
+    post = Box((0.0, 0.2, 0.25), (0.01, 0.01, 0.05))
+    assert planes(Task("Post", region, region, obstacles=(*halves, post))) == [(0, 1.3)]
     beyond = Region("table", (-0.1, 0.1), (0.1, 0.2))
     assert planes(Task("Across", region, beyond)) == [(0, 1.3)], "goals lie on one side in y"
     leaning = (Box((0.03, 0.0, 0.05), (0.01, 0.01, 0.05)),)

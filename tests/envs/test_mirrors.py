@@ -99,6 +99,18 @@ def test_mirrored_actions_have_mirrored_outcomes(name: str, mirror: Mirror) -> N
     assert off[:, :3].max() < 0.001 and off[:, 3:6].max() < 0.003
 
 
+@pytest.mark.parametrize(("name", "mirror"), PAIRS, ids=lambda value: getattr(value, "axis", value))
+def test_obstacles_stand_as_their_mirror_images_do(name: str, mirror: Mirror) -> None:
+    env = FetchEnv(name)
+    env.reset(seed=0)
+    body = [env.model.body(env.model.geom_bodyid[geom]).name for geom in range(env.model.ngeom)]
+    own = [i for i in range(env.model.ngeom) if env.model.geom(i).name.startswith("obstacle")]
+    assert len(own) == len(TASKS[name].obstacles), body
+    places = env.data.geom_xpos[own].round(6)
+    images = np.array([mirror.goal(place) for place in places]).round(6).reshape(-1, 3)
+    np.testing.assert_array_equal(sorted(images.tolist()), sorted(places.tolist()))
+
+
 @pytest.mark.parametrize("mirror", fetch_mirrors(TASKS["PnPSimpleV1"]), ids=["x", "y"])
 def test_every_entry_is_mirrored_as_it_should_be(mirror: Mirror) -> None:
     env = FetchEnv("PnPSimpleV1")

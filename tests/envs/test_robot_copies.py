@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import pickle
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import arm_and_wall
+import gymnasium as gym
 import numpy as np
 import pytest
 import toy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_follow_object.envs.robot_copies import ProcessVecEnv, robot_maker, robot_vec_env
+from sb3_follow_object.envs.robot_copies import (
+    ProcessVecEnv,
+    robot_maker,
+    robot_vec_env,
+    with_face,
+)
 
 
 def test_processes_say_nothing_of_other_environments_versions(
@@ -21,11 +29,49 @@ def test_processes_say_nothing_of_other_environments_versions(
     assert capfd.readouterr() == ("", "")
 
 
+class Lost(Exception):
+    """An error of somebody's own."""
+
+
 class Breaks(toy.PointEnv):
+    """Raises an error in the first copy's third step."""
+
+    error: Exception = ZeroDivisionError("the gripper left the table")
+
     def step(self, action: np.ndarray) -> Any:
-        if self.steps == 2:
-            raise ZeroDivisionError("the gripper left the table")
+        if self.steps == 2 and action[0] > 0.0:
+            raise self.error
         return super().step(action)
+
+
+class Loses(Breaks):
+    error = Lost()
+
+
+class Misreads(Breaks):
+    error = UnicodeDecodeError("utf-8", b"a", 0, 1, "no start")
+
+
+class Tuned(toy.PointEnv):
+    """Judges by a tolerance that a reset makes and a method changes; notes when it is closed."""
+
+    def __init__(self, closed: Path) -> None:
+        super().__init__()
+        self.closed = closed
+
+    def reset(self, **options: Any) -> Any:
+        self.tolerance = 0.05
+        return super().reset(**options)
+
+    def set_tolerance(self, tolerance: float) -> None:
+        self.tolerance = tolerance
+
+    def is_success(self, achieved: np.ndarray, desired: np.ndarray) -> Any:
+        return np.linalg.norm(achieved - desired, axis=-1) < self.tolerance
+
+    def close(self) -> None:
+        with self.closed.open("a") as file:
+            file.write("closed\n")
 
 
 def test_results_do_not_depend_on_the_number_of_processes() -> None:
@@ -65,13 +111,54 @@ def test_results_do_not_depend_on_the_number_of_processes() -> None:
     assert ends[49][1].all() and not ends[48][1].any()
 
 
-def test_what_goes_wrong_in_a_process_is_raised_here() -> None:
-    env = ProcessVecEnv(Breaks, 2, 2)
+@pytest.mark.parametrize(
+    ("kind", "error", "sentence"),
+    [
+        (Breaks, ZeroDivisionError, "^the gripper left the table$"),
+        (Loses, RuntimeError, "^Lost$"),
+        (Misreads, RuntimeError, "^UnicodeDecodeError: .*no start"),
+    ],
+)
+def test_what_goes_wrong_in_a_process_is_raised_here(
+    kind: type[Breaks], error: type[Exception], sentence: str
+) -> None:
+    env = ProcessVecEnv(kind, 4, 2)
     env.reset()
-    with pytest.raises(ZeroDivisionError, match="the gripper left the table"):
+    forward = np.array([[1.0, 0.0, 0.0]] + [[-1.0, 0.0, 0.0]] * 3)
+    with pytest.raises(error, match=sentence) as caught:
         for _ in range(3):
-            env.step(np.zeros((2, 3)))
+            env.step(forward)
+    assert "raise self.error" in str(caught.value.__cause__), "where it was raised"
+    # What the other process had to say is not taken for an answer to the next question.
+    obs = env.reset()
+    assert obs["observation"].shape == (4, 3)
+    env.step(-np.abs(forward))
     with pytest.raises(ValueError, match="in processes cannot be copied"):
         pickle.dumps(env)
     env.close()
     env.close()
+
+
+def test_copies_and_what_judges_goals_are_tuned_and_closed_alike(tmp_path: Path) -> None:
+    closed = tmp_path / "closed"
+    env = ProcessVecEnv(partial(Tuned, closed), 4, 2)
+    env.reset()
+    goal = np.zeros((1, 3))
+    near = goal + 0.05
+    assert not env.env_method("is_success", near, goal, indices=[0])[0]
+    env.env_method("set_tolerance", 0.2)
+    assert env.env_method("is_success", near, goal, indices=[0])[0]
+    assert env.get_attr("tolerance") == [0.2] * 4
+    env.close()
+    assert closed.read_text().count("closed") == 5, "four copies and the judge"
+
+
+class Own(gym.Wrapper):
+    """A wrapper that gymnasium cannot make anew."""
+
+
+def test_a_wrapper_of_ones_own_may_be_around_an_environment() -> None:
+    spec = gym.spec(arm_and_wall.ARM)
+    for env in (Own(gym.make(spec)), gym.make(spec), Own(gym.make(spec))):
+        assert with_face(env) is env, "it lacks nothing"
+        env.close()

@@ -118,6 +118,56 @@ def test_two_functions_make_a_goal_environment() -> None:
     assert env.step(np.ones(3))[4]["is_success"] is False
 
 
+class Seen(gym.Wrapper):
+    """Shows a picture, or a mode, besides numbers."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(toy.PointEnv())
+        shown: dict[str, gym.Space] = {
+            "camera": gym.spaces.Box(0, 255, (4, 4, 3), np.uint8),
+            "mode": gym.spaces.Discrete(4),
+        }
+        held = {"place": gym.spaces.Box(-1.0, 1.0, (3,)), what: shown[what]}
+        keys = self.env.observation_space.spaces  # type: ignore[attr-defined]
+        self.observation_space = gym.spaces.Dict({**keys, "observation": gym.spaces.Dict(held)})
+
+
+def two(env: Any, obs: Any) -> tuple[np.ndarray, np.ndarray]:
+    return env.position, env.goal
+
+
+class Counted(toy.PointEnv):
+    """Observations are whole numbers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        keys = dict(self.observation_space.spaces)
+        keys["observation"] = gym.spaces.Box(-9, 9, (3,), np.int64)
+        self.observation_space = gym.spaces.Dict(keys)
+
+    def reset(self, **options: Any) -> Any:
+        obs, info = super().reset(**options)
+        return {**obs, "observation": np.arange(3)}, info
+
+
+def test_an_effector_keeps_its_fractions_beside_whole_numbers() -> None:
+    env = RobotTask(Counted(), effector=lambda env: np.array([0.25, 0.5, 0.75]))
+    obs, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(obs["observation"], [0.0, 1.0, 2.0, 0.25, 0.5, 0.75])
+    assert env.observation_space.contains(obs) and env.told_effector == (3, 4, 5)
+
+
+def test_rewards_are_not_asked_where_success_is_said() -> None:
+    env = RobotTask(Dense(), is_success=lambda a, d: np.linalg.norm(a - d, axis=-1) < 0.1)
+    goal = env.reset(seed=0)[0]["desired_goal"]
+    assert env.compute_reward(
+        np.stack([goal, goal + FAR]), np.stack([goal] * 2), None
+    ).tolist() == [
+        0.0,
+        -1.0,
+    ]
+
+
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
@@ -135,6 +185,19 @@ def test_two_functions_make_a_goal_environment() -> None:
         (
             lambda: RobotTask(toy.PointEnv(), effector=lambda env: env.position[:2]),
             r"effector= must return a position of the shape \(3,\), not \(2,\)",
+        ),
+        (lambda: RobotTask(Seen("camera"), two), "hold pictures at 'camera', which cannot"),
+        (
+            lambda: RobotTask(Seen("mode"), two),
+            "hold a Discrete at 'mode', which cannot",
+        ),
+        (
+            lambda: RobotTask(Seen("camera"), effector=lambda env: env.position),
+            "effector= needs observations that are a row of numbers",
+        ),
+        (
+            lambda: RobotTask(ZeroOne(), two),
+            "ZeroOne does not tell when a goal is reached, by is_success; say it with",
         ),
     ],
 )
