@@ -259,8 +259,8 @@ def _check_parts(space: Any, env: gym.Env, at: str = "") -> None:
     elif not isinstance(space, spaces.Box) or (space.dtype == np.uint8 and len(space.shape) > 1):
         kind = "pictures" if isinstance(space, spaces.Box) else f"a {type(space).__name__}"
         raise ValueError(
-            f"{_name(env)}: its observations hold {kind}{at}, which cannot be put in a row with others' "
-            "numbers; leave that out, or say it as numbers in a Box"
+            f"{_name(env)}: its observations hold {kind}{at}, which cannot be put in a row with "
+            "others' numbers; leave that out, or say it as numbers in a Box"
         )
 
 
