@@ -2,10 +2,11 @@
 
     python benchmarks/collect.py runs/*
 
-A run takes the place of one of the same task, method and seed in benchmarks/results, or in
-benchmarks/robots/results where the environment is of others. Its configuration, versions and
-learning curve are copied. Seed 0 of FO and of HER with reaching, on this package's tasks, keeps its
-policy, with 16 bits a weight where the final test comes out the same, and its predictor:
+A run takes the place of one of the same task, method, seed and settings in benchmarks/results, or
+in benchmarks/robots/results where the environment is of others; of one of other settings with
+--replace. Its configuration, versions and learning curve are copied. Seed 0 of FO and of HER with
+reaching, on this package's tasks, keeps its policy, with 16 bits a weight where the final test
+comes out the same, and its predictor:
 `sb3-follow-object evaluate benchmarks/results/<run>` makes the test again. A run that was stopped
 has no final test, and the tables say so. Runs of benchmarks/stock_sb3.py have a curve and a result.
 """
@@ -17,6 +18,7 @@ import csv
 import json
 import shutil
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 from statistics import median
@@ -33,7 +35,7 @@ from sb3_follow_object.comparison.results import ordered, read_results, write_ta
 from sb3_follow_object.envs import TASKS
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.runs.evaluation import evaluate
-from sb3_follow_object.runs.run_folder import POLICY, noted_command
+from sb3_follow_object.runs.run_folder import POLICY, difference, noted_command
 from sb3_follow_object.settings.presets import load_config
 
 HERE = Path(__file__).parent
@@ -85,21 +87,52 @@ def folder_of(row: Row) -> Path:
     return folder / f"{file_name(row['task'])}-{row['method']}-{row['seed']}"
 
 
-def keep(run: Path) -> None:
-    """Copy what plotting a run, and of some runs evaluating it, takes."""
+def keep(run: Path, replace: bool) -> None:
+    """Copy what plotting a run, and of some runs evaluating it, takes.
+
+    Raises:
+        ValueError: it is no run or has not been validated, or is one of other settings than the
+            one in its place, or unfinished in place of a finished one (without `replace`).
+    """
+    if not (run / "versions.json").exists():
+        raise ValueError(f"{run} is no run folder: it has no versions.json")
     row = read_row(run)
+    if not row["validations"]:
+        raise ValueError(f"{run} has not been validated yet")
     target = folder_of(row)
     if run.resolve() == target.resolve():
         return  # it is here already
-    shutil.rmtree(target, ignore_errors=True)
-    target.mkdir(parents=True)
+    if target.exists() and not replace:
+        check_alike(run, row, target)
+    fresh = target.with_name(f".{target.name}.new")
+    shutil.rmtree(fresh, ignore_errors=True)
+    fresh.mkdir(parents=True)
     for name in KEPT:
         if (run / name).exists():
-            shutil.copyfile(run / name, target / name)
+            shutil.copyfile(run / name, fresh / name)
     if "success_rate" not in row:
-        (target / "command.txt").write_text(f"{row['command']}\n")
+        (fresh / "command.txt").write_text(f"{row['command']}\n")
     elif row["method"] in WITH_POLICY and row["seed"] == 0 and row["task"] in TASKS:
-        keep_policy(run, target, row)
+        keep_policy(run, fresh, row)
+    shutil.rmtree(target, ignore_errors=True)
+    fresh.rename(target)
+
+
+def check_alike(run: Path, row: Row, target: Path) -> None:
+    """Raise a ValueError where a run should not take the place of the one that is kept."""
+    if "success_rate" not in row and "success_rate" in read_row(target):
+        raise ValueError(
+            f"{run} was stopped, and {target} was not; --replace takes it all the same"
+        )
+    if not (run / "config.json").exists() or not (target / "config.json").exists():
+        return
+    settings = [asdict(load_config(folder)) for folder in (target, run)]
+    different = difference(*settings)
+    if different is not None:
+        name, kept, new = different
+        raise ValueError(
+            f"{run} has {name} {new!r}, and {target} {kept!r}; --replace takes it all the same"
+        )
 
 
 def keep_policy(run: Path, target: Path, row: Row) -> None:
@@ -108,7 +141,7 @@ def keep_policy(run: Path, target: Path, row: Row) -> None:
     env_id = load_config(run).env_id
     tested = evaluate(target / POLICY, env_id, row["episodes"], row["seed"])
     if tested.success_rate != row["success_rate"]:
-        print(f"{target.name}: with 16 bits a weight {tested.success_rate:.4f}; kept with 32")
+        print(f"{run.name}: with 16 bits a weight {tested.success_rate:.4f}; kept with 32")
         shutil.copyfile(run / POLICY, target / POLICY)
     if (run / PREDICTOR).exists():
         GoalPredictor.load(run / PREDICTOR).save(target / PREDICTOR, half=True)
@@ -296,9 +329,16 @@ def main() -> None:
     """Collect the runs named on the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("runs", nargs="*", type=Path, help="run folders")
+    parser.add_argument(
+        "--replace", action="store_true", help="take runs of other settings, and stopped ones"
+    )
+    options = parser.parse_args()
     RESULTS.mkdir(exist_ok=True)
-    for run in parser.parse_args().runs:
-        keep(run)
+    try:
+        for run in options.runs:
+            keep(run, options.replace)
+    except ValueError as error:
+        parser.error(str(error))
     rows = read_rows()
     write_summary(rows)
     for page, text in PAGES.items():

@@ -32,6 +32,9 @@ _OF_IMAGINED = (
     "n_test_episodes",
     "store_tests",
 )
+# Settings of the object's stage, in runs that begin with one.
+_OF_OBJECT = ("object_", "inverse_fit", "predictor_fit")
+_CONFIG = "config.json"
 INTERRUPTED = 130
 
 
@@ -61,7 +64,7 @@ def _run(arguments: list[str]) -> int:
         return USER_ERROR
     except KeyboardInterrupt:
         hint = "interrupted"
-        if args.run_command is _train and args.run.exists():
+        if args.run_command is _train and (args.run / _CONFIG).exists():
             hint += f"; go on with: {PROGRAM} train --resume --run {shlex.quote(str(args.run))}"
         if args.run_command is _compare:
             hint += "; the same command goes on where it stopped"
@@ -145,6 +148,7 @@ def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> Non
 
 def _config(args: argparse.Namespace) -> RunConfig:
     """Return the configuration that the flags describe."""
+    from ..comparison.cells import needs_object_stage
     from ..settings.presets import parse_override, run_config
 
     if args.env is None:
@@ -164,6 +168,10 @@ def _config(args: argparse.Namespace) -> RunConfig:
         if text.split("=")[0].split(".")[0] in _OF_IMAGINED and not config.settings["imagine"]:
             raise ValueError(
                 f"--set {text} does nothing: method {config.method!r} imagines no goals"
+            )
+        if text.startswith(_OF_OBJECT) and not needs_object_stage(config):
+            raise ValueError(
+                f"--set {text} does nothing: method {config.method!r} has no object's stage"
             )
     return config
 

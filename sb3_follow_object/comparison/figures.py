@@ -64,7 +64,8 @@ def draw_results(
     drawn = list(dict.fromkeys([*methods, *ordered(METHODS, (run.method for run in runs))]))
     tasks = [*TASKS, *sorted({run.task for run in runs} - set(TASKS))]
     groups = group_runs(runs, tasks, drawn)
-    others = [task for task in TASKS if task not in PAIR]
+    own = not runs or any(run.task in TASKS for run in runs)
+    others = [task for task in tasks if task not in PAIR and (own or task not in TASKS)]
     figures: dict[str, Callable[[], Any]] = {
         PNP_SIMPLE: lambda: _pnp_simple(groups, drawn),
         OTHER_TASKS: lambda: _curves(groups, drawn, others, "env_steps"),

@@ -73,6 +73,9 @@ def plan(
     return cells
 
 
+_TO_THE_END = {"solved_at": 0.0}  # methods are compared after equally many steps
+
+
 def _env_id(task: str) -> str:
     """Return the id that a short name or an id means."""
     if task in TASKS:
@@ -85,12 +88,7 @@ def _env_id(task: str) -> str:
 
 
 def _config(env_id: str, method: str, seed: int, settings: Settings, threads: int) -> RunConfig:
-    # None ends early: methods are compared after equally many steps.
-    overrides: dict[str, Any] = {
-        "n_threads": threads,
-        "torch_threads": threads,
-        "solved_at": 0.0,
-    }
+    overrides: dict[str, Any] = {"n_threads": threads, "torch_threads": threads, **_TO_THE_END}
     if settings.steps is not None:
         overrides["n_timesteps"] = settings.steps
     if settings.paper_evaluation:
@@ -113,10 +111,11 @@ def _command(path: Path, config: RunConfig, settings: Settings) -> str:
         words += ["--steps", str(settings.steps)]
     if settings.preset != "default":
         words += ["--preset", settings.preset]
-    changes = dict(_paper_rhythm(config.env_id)) if settings.paper_evaluation else {}
+    changes: dict[str, Any] = dict(_TO_THE_END)
+    if settings.paper_evaluation:
+        changes |= _paper_rhythm(config.env_id)
     changes |= settings.overrides or {}
-    if changes:
-        words += ["--set", *(f"{name}={json.dumps(value)}" for name, value in changes.items())]
+    words += ["--set", *(f"{name}={json.dumps(value)}" for name, value in changes.items())]
     return shlex.join(words)
 
 

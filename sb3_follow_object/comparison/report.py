@@ -20,7 +20,7 @@ from ..runs.run_folder import CONFIG, RESULT, VERSIONS, flat, noted_command, rea
 from ..settings.presets import load_config
 from .grid import task_name
 from .plots import Curve, read_curve, spread
-from .results import Run, group_runs, ordered, read_results, table_rows
+from .results import FINISHED, Run, group_runs, ordered, read_results, table_rows
 
 _TEMPLATE = Path(__file__).parent / "report.html"
 _KINDS = {".png": "image/png", ".mp4": "video/mp4"}
@@ -194,21 +194,28 @@ def _comparison_charts(runs: Sequence[Run], methods: Sequence[str]) -> list[dict
     for group_task in dict.fromkeys(group.task for group in group_runs(runs)):
         series = []
         for number, method in enumerate(methods):
-            curves = []
+            curves, others = [], []
             for run in runs:
                 if (run.task, run.method) == (group_task, method) and is_run(run.folder):
                     try:
-                        curves.append(read_curve(run.folder))
+                        curve = read_curve(run.folder)
                     except ValueError:  # nothing has been validated: there is nothing to draw
                         continue
-            if not curves:
-                continue
-            points, (low, middle, high) = spread(curves, "env_steps", "success_rate")
-            name = f"{method} ({len(curves)} seeds)" if len(curves) > 1 else method
-            line = _line(name, number, points, middle)
-            if len(curves) > 1:
-                line["band"] = _numbers(points, low, high)
-            series.append(line)
+                    if run.status == FINISHED:
+                        curves.append(curve)
+                    else:
+                        others.append((run, curve))
+            if curves:
+                points, (low, middle, high) = spread(curves, "env_steps", "success_rate")
+                name = f"{method} ({len(curves)} seeds)" if len(curves) > 1 else method
+                line = _line(name, number, points, middle)
+                if len(curves) > 1:
+                    line["band"] = _numbers(points, low, high)
+                series.append(line)
+            for run, curve in others:  # they would cut the median where they are
+                columns = curve.columns
+                name = f"{method}, seed {run.seed} ({run.status})"
+                series.append(_line(name, number, columns["env_steps"], columns["success_rate"]))
         if series:
             charts.append(_chart(group_task, series, _SHARES))
     return charts

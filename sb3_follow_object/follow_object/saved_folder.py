@@ -14,6 +14,7 @@ from ..envs.goal_envs import known_id
 from ..imagination.goal_predictor import GoalPredictor
 from ..object_stage.networks import FILE as OBJECT_NETWORKS
 from ..object_stage.networks import ObjectNetworks
+from ..settings.run_config import CONFIG
 
 _SETTINGS, _PREDICTOR, _STATE = "settings.json", "predictor", "state.safetensors"
 
@@ -36,7 +37,13 @@ class Saved:
 
 
 def write(folder: Path, saved: Saved) -> None:
-    """Write a folder; files of an earlier save are replaced, or removed."""
+    """Write a folder; files of an earlier save are replaced, or removed.
+
+    Raises:
+        ValueError: it is the folder of a run, whose files have the same names.
+    """
+    if (folder / CONFIG).exists():
+        raise ValueError(f"{folder} is the folder of a run; save into another one")
     settings = json.dumps(saved.settings, indent=2).encode()
     folder.mkdir(parents=True, exist_ok=True)
     if saved.predictor is not None:

@@ -94,10 +94,20 @@ def write_versions(folder: Path) -> None:
 
 
 def take_steps(folder: Path, config: RunConfig, command: str = "") -> None:
-    """Note in a run's folder the steps that it is resumed with, where they are others."""
+    """Note in a run's folder the steps that it is resumed with, where they are others.
+
+    Raises:
+        ValueError: its newest checkpoint has had more than that; nothing is written.
+    """
     kept = RunConfig(**json.loads((folder / CONFIG).read_text()))
     if kept.total_timesteps == config.total_timesteps:
         return
+    gone = max((int(path.stem.rpartition("-")[2]) for path in checkpoint_files(folder)), default=0)
+    if config.total_timesteps < gone:
+        raise ValueError(
+            f"the run in {folder} has had {gone} env steps already; its steps are counted from its "
+            "beginning, so give more than that"
+        )
     if command and (folder / COMMAND).exists():
         earlier = (folder / COMMAND).read_text()
         atomic_write(folder / COMMAND, f"{earlier}{command}\n".encode())

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
 
+from sb3_follow_object.command.cli import _COMMANDS, _config
+from sb3_follow_object.command.cli_options import make_parser
 from sb3_follow_object.comparison.cells import Settings, prepare, shared_stage, stage_settings
 from sb3_follow_object.comparison.grid import plan
 from sb3_follow_object.comparison.ledger import Ledger, read_grid
@@ -42,10 +45,20 @@ def test_command_trains_the_same_run(tmp_path: Path) -> None:
     (cell,) = plan(tmp_path, ["PushDoubleObstacles"], ["fo"], [4], settings)
     assert cell.config.eval_every == 1900 * 80
     assert cell.config.n_eval_episodes == 380
-    words = (
-        "--method fo --seed 4 --threads 1 --steps 1000 --set eval_every=152000 n_eval_episodes=380"
-    )
-    assert f"{words} curriculum.p=0.5" in cell.command
+    words = "--method fo --seed 4 --threads 1 --steps 1000 --set solved_at=0.0 eval_every=152000"
+    assert f"{words} n_eval_episodes=380 curriculum.p=0.5" in cell.command
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("steps", [None, 1000])
+def test_command_says_all_settings_of_its_run(
+    preset: str, steps: int | None, tmp_path: Path
+) -> None:
+    settings = Settings(steps, preset, {"learning_starts": 500})
+    methods = [method for method in METHODS if preset == "default" or method != "rher"]
+    for cell in plan(tmp_path, ["PnPShelf"], methods, [2], settings):
+        arguments = make_parser(_COMMANDS).parse_args(shlex.split(cell.command)[1:])
+        assert _config(arguments) == cell.config
 
 
 def test_every_method_can_be_planned(tmp_path: Path) -> None:

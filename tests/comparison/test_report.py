@@ -94,6 +94,18 @@ def test_comparison_has_quartiles_over_seeds_and_what_settings_differ(tmp_path: 
     assert "Settings in which they differ" in text and "Versions that all runs share" in text
 
 
+def test_a_run_that_goes_on_has_a_line_of_its_own(tmp_path: Path) -> None:
+    for seed in (0, 1, 2):
+        make_run(tmp_path / f"fo-{seed}", seed=seed)
+    running = tmp_path / "fo-2"
+    (running / "result.json").unlink()
+    (running / "evaluations.csv").write_text(f"{HEAD}\n1000,1000,0,0,10,0.0,-9.5,4,2\n")
+    write_comparison_report(tmp_path, tmp_path / "report.html", {})
+    series = {s["name"]: s for s in charts(tmp_path / "report.html")["PushSideGap"]["series"]}
+    assert series["fo (2 seeds)"]["points"][-1] == [3000, 0.75]
+    assert series["fo, seed 2 (unfinished)"]["points"] == [[1000, 0.0]]
+
+
 def test_names_cannot_end_the_script_that_holds_the_data(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     (run / "progress_0.csv").write_text("eval/env_steps,</script><b>\n1000,1.0\n")

@@ -137,6 +137,14 @@ def test_save_replaces_everything_of_an_earlier_one(
     assert FollowObject.load(tmp_path / "run").predictor is None
 
 
+def test_save_leaves_a_runs_folder_alone(tmp_path: Path) -> None:
+    (tmp_path / "predictor").mkdir()
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ValueError, match="is the folder of a run; save into another one"):
+        FollowObject(ENV, imagine=False, **TINY).save(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"predictor", "config.json"}
+
+
 def test_save_keeps_train_freq_and_refuses_python_objects(
     predictor: GoalPredictor, tmp_path: Path
 ) -> None:

@@ -233,6 +233,14 @@ def test_finished_run_given_more_steps_is_the_longer_run(
     assert runs.outcome(tmp_path) == whole
 
 
+def test_fewer_steps_than_are_gone_are_refused_and_nothing_is_lost(crashed: Path) -> None:
+    kept = {path: path.read_bytes() for path in crashed.iterdir() if path.is_file()}
+    fewer = runs.config(total_timesteps=1500)
+    with pytest.raises(ValueError, match=r"has had \d+ env steps already; its steps are counted"):
+        train(fewer, crashed, resume=True, report=runs.quiet)
+    assert {path: path.read_bytes() for path in crashed.iterdir() if path.is_file()} == kept
+
+
 def test_finished_run_without_a_checkpoint_is_given_no_more_steps(tmp_path: Path) -> None:
     runs.run(tmp_path, config=runs.config(total_timesteps=3000))
     kept = runs.outcome(tmp_path)
