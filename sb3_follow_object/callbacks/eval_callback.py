@@ -140,6 +140,7 @@ class OriginalGoalEvalCallback(CopyableCallback):
 
     def _on_training_end(self) -> None:
         self._wall_before, self._started = self.wall_s, None
+        self._resumed = False  # what `learn` begins next may count anew
 
     def _on_training_start(self) -> None:
         self._wall_before, self._started = self.wall_s, time.monotonic()

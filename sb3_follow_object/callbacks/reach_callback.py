@@ -78,8 +78,20 @@ class ReachCallback(CopyableCallback):
             )
         if self.policy is None:
             self.policy = self._make_policy()
+        told = self._ask("reach_settings")[0]
+        if (list(told.effector), told.tolerance) != (self.policy.effector, self.policy.tolerance):
+            raise ValueError(
+                f"this ReachCallback was taught with the effector {self.policy.effector} within "
+                f"{self.policy.tolerance} m, and the environment has {list(told.effector)} within "
+                f"{told.tolerance} m; give a new one"
+            )
         if self.policy.has_learned:
             self._carry(self.policy)
+
+    def _on_training_end(self) -> None:
+        assert self.policy is not None
+        if self.policy.has_learned:  # whoever plays there now shall see what the learner can do
+            self._ask("set_reach", self.policy.actor(), 0.0)
 
     def _on_step(self) -> bool:
         self._episode_ended |= bool(np.any(self.locals["dones"]))

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from ..any_task.context import bodies_in, read_context
@@ -67,6 +67,11 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
     ) -> None:
         if mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {mode!r}.")
+        if is_vecenv_wrapped(venv, VecNormalize):
+            raise ValueError(
+                "ImaginedGoalVecEnv needs goals in metres: put it inside VecNormalize, not around "
+                "it"
+            )
         super().__init__(venv)
         self._space, self._dtype = checked_goals(venv.observation_space, venv.has_attr)
         check_horizons(predictor, curriculum)

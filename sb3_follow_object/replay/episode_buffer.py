@@ -248,6 +248,12 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
 
     def check_ready(self) -> None:
         """Raise RuntimeError while there is nothing to draw from."""
+        if not self.is_ready() and self.full:
+            raise RuntimeError(
+                "the replay buffer has forgotten its last finished episode while others run: let "
+                f"buffer_size hold two episodes of every environment; it holds {self.buffer_size} "
+                "steps of each"
+            )
         if not self.is_ready():
             raise RuntimeError(
                 "the replay buffer holds no finished episode yet: set learning_starts to at least "

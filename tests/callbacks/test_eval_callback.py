@@ -100,6 +100,19 @@ def test_a_resumed_evaluation_goes_on_with_its_file(tmp_path: Path) -> None:
     assert float(found[2]["wall_s"]) >= float(kept[1]["wall_s"])
 
 
+def test_learning_anew_after_a_resumption_counts_anew() -> None:
+    evaluation = OriginalGoalEvalCallback(bare(), N, 40)
+    first = OriginalGoalEvalCallback(bare(), N, 40)
+    learner(bare()).learn(160, callback=first)
+    evaluation.load_state_dict(first.state_dict())
+    model = learner(bare())
+    model.num_timesteps = 160
+    model.learn(80, callback=evaluation, reset_num_timesteps=False)
+    before = evaluation.n_evaluations
+    model.learn(160, callback=evaluation)
+    assert evaluation.n_evaluations - before == 160 // 40
+
+
 def test_only_training_counts_as_training_time(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(eval_callback.time, "monotonic", lambda: now[0])

@@ -172,7 +172,32 @@ def test_validation_in_the_same_wrappers_never_reaches_first(straight: None) -> 
     validation = OriginalGoalEvalCallback(eval_env, 2, every_steps=3 * N * HORIZON, seed=0)
     model.learn(6 * N * HORIZON, [ReachCallback(share=1.0, **TINY), validation])
     assert validation.n_evaluations == 2
-    assert effectors_move(env) and not effectors_move(eval_env)
+    assert not effectors_move(eval_env)
+
+
+def test_what_plays_in_the_environment_after_training_gets_no_help(straight: None) -> None:
+    env = FACES["VecEnv"]()
+    model, callback = learner(env), ReachCallback(share=1.0, fade=False, **TINY)
+    shares: list[float] = []
+
+    class Look(BaseCallback):
+        def _on_step(self) -> bool:
+            shares.append(env.approach.share)  # type: ignore[attr-defined]
+            return True
+
+    model.learn(4 * N * HORIZON, [callback, Look()])
+    assert shares[-1] == 1.0, "in training they reach"
+    assert not effectors_move(env)
+    model.learn(2 * N * HORIZON, [callback, Look()], reset_num_timesteps=False)
+    assert shares[-1] == 1.0, "and when it goes on"
+
+
+def test_a_callback_is_not_taught_with_another_effector() -> None:
+    model, callback = learner(FACES["VecEnv"]()), ReachCallback(**TINY)
+    model.learn(N * HORIZON, callback)
+    other = ReachFirstVecEnv(DummyVecEnv([lambda: gym.make(TASK)] * N), effector=(3, 4, 5))
+    with pytest.raises(ValueError, match=r"was taught with the effector \[0, 1, 2\] .* give a new"):
+        learner(other).learn(N * HORIZON, callback)
 
 
 def reports(callback: ReachCallback, *rollouts: tuple[int, int, int, int]) -> list[float]:
@@ -207,7 +232,7 @@ def test_faded_policy_learns_and_reaches_no_more(monkeypatch: pytest.MonkeyPatch
     model, callback, logged = learner(env), ReachCallback(share=1.0, **TINY), Logged()
     model.learn(2 * N * HORIZON, callback)
     assert callback.policy is not None
-    assert callback.policy._n_updates == 2 * TINY["n_updates"] and effectors_move(env)
+    assert callback.policy._n_updates == 2 * TINY["n_updates"]
     callback.own_success = 0.99  # of a learner that nearly always comes there, and goes on to
     monkeypatch.setattr(callback, "_count", lambda: None)
     model.learn(2 * N * HORIZON, [callback, logged], reset_num_timesteps=False)

@@ -12,7 +12,13 @@ import toy
 from gymnasium.utils.env_checker import check_env
 from imagined import N, check_transitions, episodes, imagining, play
 from stable_baselines3 import DDPG, SAC, TD3, HerReplayBuffer
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnv,
+    VecMonitor,
+    VecNormalize,
+)
 
 from sb3_follow_object.imagination.curriculum import Curriculum
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
@@ -30,6 +36,13 @@ def test_the_shown_goal_is_the_goal_of_the_whole_episode(levels: str) -> None:
     steps = [step for episode in finished for step in episode]
     # The test would say nothing if both goals were always reached or missed together.
     assert any(step["info"]["is_success"] != step["info"]["original_success"] for step in steps)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_goals_in_standard_deviations_are_refused(training: bool) -> None:
+    normalised = VecNormalize(DummyVecEnv([toy.PointEnv] * N), training=training)
+    with pytest.raises(ValueError, match="put it inside VecNormalize, not around it"):
+        ImaginedGoalVecEnv(normalised, toy.StraightPredictor(), toy.curriculum())
 
 
 def test_original_goals_come_from_the_environment() -> None:

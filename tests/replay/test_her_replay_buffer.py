@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from small_buffers import LazyPointEnv, as_arrays, fill, make_buffer, make_env
 from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -299,3 +300,17 @@ def test_energy_needs_a_height() -> None:
     env = DummyVecEnv([Flat])
     with pytest.raises(ValueError, match="goals of 3 numbers; these have 2"):
         make_buffer(env, moved_priority="energy")
+
+
+def test_a_buffer_that_forgets_an_episode_while_the_next_one_runs_says_so() -> None:
+    model = DDPG(
+        "MultiInputPolicy",
+        TimeLimit(PointEnv(), HORIZON),
+        replay_buffer_class=FollowObjectReplayBuffer,
+        buffer_size=HORIZON + 1,
+        learning_starts=HORIZON,
+        train_freq=1,
+        policy_kwargs={"net_arch": [8]},
+    )
+    with pytest.raises(RuntimeError, match="hold two episodes of every environment; it holds 11"):
+        model.learn(3 * HORIZON)
