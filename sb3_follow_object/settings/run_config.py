@@ -33,7 +33,8 @@ class RunConfig(Group):
         n_final_episodes: fresh episodes of the last policy's final test, >= 1.
         checkpoint_minutes: wall time between two checkpoints, > 0; does not change the result.
         keep_checkpoints: how many of the last checkpoints are kept, >= 1.
-        keep_last_checkpoint: whether a finished run keeps one, to be given more steps later.
+        keep_last_checkpoint: whether a finished run keeps one, to be given more steps later; one
+            that ended as solved takes none.
         torch_threads: of PyTorch in the robot's gradient steps, >= 1; all else takes one.
         module: that registers the task when it is imported; None for the package's own tasks and
             those that gymnasium knows by itself.
@@ -77,7 +78,11 @@ class RunConfig(Group):
         Whole, setting("how many of the last are kept while it trains", ge=1, le=1000)
     ] = 2
     keep_last_checkpoint: Annotated[
-        Flag, setting("whether a finished run keeps one, to be given more steps later")
+        Flag,
+        setting(
+            "whether a finished run keeps one, to be given more steps later; one that ended as "
+            "solved takes none"
+        ),
     ] = False
     torch_threads: Annotated[
         Whole,
