@@ -126,10 +126,15 @@ def may_be_faced(env: gym.Env) -> bool:
 
 
 def _make(spec: EnvSpec, wrapped: bool, options: dict[str, Any]) -> gym.Env:
-    if is_of_robotics(spec):
-        import_robotics()  # quietly, before gymnasium does so in a process that has not
-    env = gym.make(spec, **options)
+    env = make_registered(spec, **options)
     return _faced(env) if wrapped else env
+
+
+def make_registered(spec: EnvSpec, **options: Any) -> gym.Env:
+    """Make an environment of gymnasium's, also in a process that has not registered it."""
+    if is_of_robotics(spec):
+        import_robotics()  # quietly, before gymnasium does so
+    return gym.make(spec, **options)
 
 
 class ProcessVecEnv(VecEnv):

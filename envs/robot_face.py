@@ -225,7 +225,7 @@ def _goal_space(env: gym.Env) -> spaces.Dict:
     space = env.observation_space
     shown = _without_goals(space.spaces if isinstance(space, spaces.Dict) else space)
     _check_parts(shown, env)
-    size = sum(part.size for part in _parts(_sample(shown)))
+    size = spaces.flatdim(spaces.Dict(dict(shown)) if isinstance(shown, Mapping) else shown)
     sizes = {"observation": size, "achieved_goal": POSITIONS.size, "desired_goal": POSITIONS.size}
     return spaces.Dict(
         {key: spaces.Box(-np.inf, np.inf, (n,), np.float64) for key, n in sizes.items()}
@@ -262,12 +262,6 @@ def _check_parts(space: Any, env: gym.Env, at: str = "") -> None:
             f"{_name(env)}: its observations hold {kind}{at}, which cannot be put in a row with "
             "others' numbers; leave that out, or say it as numbers in a Box"
         )
-
-
-def _sample(space: Any) -> Any:
-    if isinstance(space, Mapping):
-        return {name: _sample(part) for name, part in space.items()}
-    return space.sample()
 
 
 def _parts(obs: Any) -> list[np.ndarray]:

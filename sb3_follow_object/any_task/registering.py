@@ -10,12 +10,11 @@ from types import CodeType, FunctionType
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.envs.registration import EnvSpec
 
 from ..envs.goal_envs import SAY_LENGTH
-from ..envs.registration import import_robotics, import_task
+from ..envs.registration import import_task
+from ..envs.robot_copies import make_registered
 from ..envs.robot_face import EffectorOf, GoalOf, Judge, RobotTask
-from ..envs.robotics import is_of_robotics
 
 MakeEnv = Callable[[], gym.Env]
 NAMESPACE = "Followed"
@@ -63,7 +62,7 @@ def registered(
         name = import_task(env_id)
         if name not in gym.registry:
             raise ValueError(f"there is no environment {env_id!r}")
-        make_env = partial(_make_registered, gym.spec(name))
+        make_env = partial(make_registered, gym.spec(name))
         title, _, version = name.rpartition("/")[2].rpartition("-v")
     else:
         title = getattr(make_env, "__name__", type(make_env).__name__)
@@ -131,13 +130,6 @@ def _written(function: FunctionType) -> tuple[Any, ...]:
     return function.__code__, function.__defaults__, named, cells
 
 
-def _make_registered(spec: EnvSpec, **options: Any) -> gym.Env:
-    """Make an environment of gymnasium's, also in a process that has not registered it."""
-    if is_of_robotics(spec):
-        import_robotics()  # quietly
-    return gym.make(spec, **options)
-
-
 def _horizon(make_env: MakeEnv, name: str) -> int:
     env = make_env()
     try:
@@ -160,7 +152,7 @@ def _make(
     render_mode: str | None = None,
     **options: Any,
 ) -> gym.Env:
-    by_id = isinstance(make_env, partial) and make_env.func is _make_registered
+    by_id = isinstance(make_env, partial) and make_env.func is make_registered
     if render_mode is not None and by_id:
         options = {**options, "render_mode": render_mode}
     env = make_env(**options)

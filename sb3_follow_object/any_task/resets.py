@@ -114,9 +114,13 @@ def check_same_shapes(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
             "its model has other bodies, geoms or joints in other episodes; the object's scene "
             "needs the same in all: move what is not wanted out of the way"
         )
-    matter = touching_geoms(first) & ~robot_bodies(first)[first.geom_bodyid]
     for what, name in _SHAPES.items():
-        differ = np.abs(getattr(first, name) - getattr(model, name)).max(axis=1) > _SAME
+        differ = (
+            np.abs(getattr(first, name) - getattr(model, name)).max(axis=1, initial=0.0) > _SAME
+        )
+        if not differ.any():  # as in most resets
+            continue
+        matter = touching_geoms(first) & ~robot_bodies(first)[first.geom_bodyid]
         for geom in map(int, np.flatnonzero(matter & differ)):
             of = body_name(first, int(first.geom_bodyid[geom]))
             raise ValueError(

@@ -34,7 +34,6 @@ _OF_IMAGINED = (
 )
 # Settings of the object's stage, in runs that begin with one.
 _OF_OBJECT = ("object_", "inverse_fit", "predictor_fit")
-_CONFIG = "config.json"
 INTERRUPTED = 130
 
 
@@ -63,8 +62,10 @@ def _run(arguments: list[str]) -> int:
         print(f"{PROGRAM}: {_sentence(error)}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:
+        from ..settings.run_config import CONFIG
+
         hint = "interrupted"
-        if args.run_command is _train and (args.run / _CONFIG).exists():
+        if args.run_command is _train and (args.run / CONFIG).exists():
             hint += f"; go on with: {PROGRAM} train --resume --run {shlex.quote(str(args.run))}"
         if args.run_command is _compare:
             hint += "; the same command goes on where it stopped"

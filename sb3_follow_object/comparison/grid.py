@@ -27,6 +27,7 @@ _SHARES = ("torch_threads", "settings.n_threads", "checkpoint_minutes")
 
 # The paper's epoch is 50 cycles of 38 episodes, after which 380 episodes are tested.
 _EPOCH_EPISODES, _PAPER_EPISODES = 1900, 380
+_TO_THE_END = {"solved_at": 0.0}  # methods are compared after equally many steps
 
 
 def plan(
@@ -71,9 +72,6 @@ def plan(
                     cell = replace(cell, config=kept, command=_command(path, kept, settings))
                 cells.append(cell)
     return cells
-
-
-_TO_THE_END = {"solved_at": 0.0}  # methods are compared after equally many steps
 
 
 def _env_id(task: str) -> str:

@@ -248,18 +248,19 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
 
     def check_ready(self) -> None:
         """Raise RuntimeError while there is nothing to draw from."""
-        if not self.is_ready() and self.full:
+        if self.is_ready():
+            return
+        if self.full:
             raise RuntimeError(
                 "the replay buffer has forgotten its last finished episode while others run: let "
                 f"buffer_size hold two episodes of every environment; it holds {self.buffer_size} "
                 "steps of each"
             )
-        if not self.is_ready():
-            raise RuntimeError(
-                "the replay buffer holds no finished episode yet: set learning_starts to at least "
-                "one episode of every environment; or, where a loaded model goes on with "
-                "reset_num_timesteps=False, load its replay buffer too"
-            )
+        raise RuntimeError(
+            "the replay buffer holds no finished episode yet: set learning_starts to at least "
+            "one episode of every environment; or, where a loaded model goes on with "
+            "reset_num_timesteps=False, load its replay buffer too"
+        )
 
     def moved_share(self) -> float:
         """Share of the stored transitions that belong to episodes in which the object moved."""
