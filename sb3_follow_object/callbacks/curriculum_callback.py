@@ -29,7 +29,8 @@ class CurriculumCallback(CopyableCallback):
     finished. Records curriculum/k_max, curriculum/test_success and curriculum/test_steps.
 
     The model carries the curriculum's state as ``model.curriculum_state``, which SB3 saves with it:
-    training that goes on from a loaded model goes on at its k_max.
+    training that goes on from a loaded model goes on at its k_max. A model that has not trained
+    begins at the curriculum's first one, whatever another has come to in these wrappers.
 
     Args:
         test_env: ImaginedGoalVecEnv with mode="test", or wrappers around one, sharing the
@@ -104,7 +105,9 @@ class CurriculumCallback(CopyableCallback):
 
     def _on_training_start(self) -> None:
         self._follow_training_env()
-        if self._is_training and self.model.num_timesteps > 0:
+        broken_off = self._is_training and self.model.num_timesteps > 0
+        # Who knows what step the environment stands at after an exception? Ours do.
+        if broken_off and not isinstance(self.model, WholeEpisodesDDPG):
             self._begin_new_episodes()
         self._is_training = True
         another = self._trained is not self.model
@@ -113,8 +116,18 @@ class CurriculumCallback(CopyableCallback):
             self._cycles, self._episode_ended = 0, False
         if another and hasattr(self.model, "curriculum_state"):
             self.curriculum.load_state_dict(self.model.curriculum_state)
+        elif another and self.model.num_timesteps == 0:
+            self._restart_curriculum()
         self._trained = self.model
         self._share_curriculum()
+
+    def _restart_curriculum(self) -> None:
+        """Begin at the first level, whatever another model has come to in these wrappers."""
+        before = imagination_of(self.training_env, _ASKER)[1].state_dict()
+        self.curriculum.restart()
+        if self.curriculum.state_dict() != before:  # running episodes show goals of other levels
+            self._share_curriculum()
+            self._begin_new_episodes()
 
     def _follow_training_env(self) -> None:
         """Let the tests and the replay buffer have what training has, whatever was replaced."""
@@ -138,10 +151,7 @@ class CurriculumCallback(CopyableCallback):
         return self._copied is not self.training_env or ours != theirs
 
     def _begin_new_episodes(self) -> None:
-        """Reset the environment after an exception: who knows what step it stands at."""
         model: Any = self.model
-        if isinstance(model, WholeEpisodesDDPG):
-            return  # it knows
         model._last_obs = self.training_env.reset()
         model._last_episode_starts = np.ones(self.training_env.num_envs, dtype=bool)
         normaliser = model.get_vec_normalize_env()

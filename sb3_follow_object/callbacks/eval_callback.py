@@ -26,8 +26,9 @@ class OriginalGoalEvalCallback(CopyableCallback):
     eval/success_rate, eval/mean_return and eval/env_steps, and appends a row to a CSV file.
 
     Args:
-        eval_env: vectorised environment that shows the original goals, not in VecNormalize: a
-            model that was trained in one normalises what it sees here too.
+        eval_env: vectorised environment that shows the original goals, so without
+            ImaginedGoalWrapper, and not in VecNormalize: a model that was trained in one normalises
+            what it sees here too.
         n_episodes: episodes of an evaluation, >= 1.
         every_steps: the model's num_timesteps, tests included, between evaluations, >= 1.
         csv_path: file for the rows; None writes none. A file that holds rows from after the
@@ -43,8 +44,8 @@ class OriginalGoalEvalCallback(CopyableCallback):
         n_evaluations: evaluations so far.
 
     Raises:
-        ValueError: an argument is outside its range, eval_env is in VecNormalize, or the CSV file
-            belongs to another run.
+        ValueError: an argument is outside its range, eval_env is in VecNormalize or imagines goals,
+            or the CSV file belongs to another run.
     """
 
     COLUMNS = (
@@ -75,6 +76,11 @@ class OriginalGoalEvalCallback(CopyableCallback):
         if is_vecenv_wrapped(eval_env, VecNormalize):
             raise ValueError(
                 "eval_env is in VecNormalize; the model's own normalises already: leave it out."
+            )
+        if eval_env.has_attr("curriculum"):
+            raise ValueError(
+                "eval_env imagines goals; an evaluation shows the original ones: make one without "
+                "ImaginedGoalVecEnv and ImaginedGoalWrapper."
             )
         self.eval_env = eval_env
         self.n_episodes = checked_whole("n_episodes", n_episodes, 1)

@@ -41,6 +41,7 @@ class Curriculum:
     """
 
     stride = 1  # of those pickled before there was one
+    first_k_max = 1
 
     def __init__(
         self,
@@ -78,7 +79,7 @@ class Curriculum:
         self.finish_threshold = settings.finish_threshold
         self.sampling = settings.sampling
         self.min_distance = settings.min_distance
-        self.k_max = checked_whole("k_max", settings.k_max, 1, self.n_levels)
+        self.k_max = self.first_k_max = checked_whole("k_max", settings.k_max, 1, self.n_levels)
         self._passed_last = False
         self._tests = SequentialTest() if settings.sequential else None
 
@@ -139,6 +140,12 @@ class Curriculum:
             held = int(success_rate / threshold + 1e-9) if threshold > 0.0 else 1
             self.k_max = min(self.n_levels, self.k_max + min(max(1, held), self.stride))
         return True
+
+    def restart(self) -> None:
+        """Begin anew at the first value of k_max."""
+        self.k_max, self._passed_last = self.first_k_max, False
+        if self._tests is not None:
+            self._tests = SequentialTest()
 
     def state_dict(self) -> dict[str, Any]:
         """Return what training has changed, and what it only makes sense with (JSON types)."""

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from ..common.vec_env_copies import CopyableVecEnvWrapper
 from ..imagination.goal_env import LAST, with_terminal_observations
 from ..imagination.vec_env import ImaginedGoalVecEnv
-from ..replay.episode_buffer import EXECUTED
+from ..replay.episode_buffer import EXECUTED, GIVEN
 from ..settings.stages import ReachFirstSettings
 from .actor import ReachActor
 from .approach import (
@@ -60,7 +60,7 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
         actions = cast(spaces.Box, venv.action_space)
         self.approach = Approach(venv.num_envs, actions, reach)
         self._obs: Observation = {}
-        self._executed = np.zeros((venv.num_envs, *actions.shape))
+        self._given = self._executed = np.zeros((venv.num_envs, *actions.shape))
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the environments and the reaching; takes effect at the next reset."""
@@ -92,7 +92,7 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
 
     def step_async(self, actions: np.ndarray) -> None:
         """Step with what is executed."""
-        self._executed = self.approach.act(self._obs, actions)
+        self._given, self._executed = actions, self.approach.act(self._obs, actions)
         self.venv.step_async(self._executed)
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -101,7 +101,8 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
         obs = cast(Observation, venv_obs)
         self.approach.arrive(with_terminal_observations(obs, dones, infos), dones)
         infos = [
-            {**info, EXECUTED: action} for info, action in zip(infos, self._executed, strict=True)
+            {**info, GIVEN: given, EXECUTED: executed}
+            for info, given, executed in zip(infos, self._given, self._executed, strict=True)
         ]
         self._obs = obs
         ended = np.flatnonzero(dones)

@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from ..common.copies import WholeCopies
 from ..imagination.goal_env import LAST
-from ..replay.episode_buffer import EXECUTED
+from ..replay.episode_buffer import EXECUTED, GIVEN
 from ..settings.stages import ReachFirstSettings
 from .actor import ReachActor
 from .approach import (
@@ -31,9 +31,9 @@ class ReachFirstWrapper(
     """Let the effector reach for the object first in a share of the episodes.
 
     While it reaches, the actions given are replaced; infos carry "executed_action", which
-    `FollowObjectReplayBuffer` stores. Nothing reaches until a `ReachCallback` has taught the reach
-    policy, so the same YAML makes the environment that trains and those that evaluate or play. Put
-    it outside of ImaginedGoalWrapper.
+    `FollowObjectReplayBuffer` stores, and "given_action", which it compares with what was chosen.
+    Nothing reaches until a `ReachCallback` has taught the reach policy, so the same YAML makes the
+    environment that trains and those that evaluate or play. Put it outside of ImaginedGoalWrapper.
 
     Args:
         env: environment with Dict goal observations.
@@ -86,7 +86,7 @@ class ReachFirstWrapper(
         self._obs = _batch_of_one(obs)
         ended = terminated or truncated
         self.approach.arrive(self._obs, np.array([ended]))
-        info = {**info, EXECUTED: executed, **({LAST: obs} if ended else {})}
+        info = {**info, GIVEN: action, EXECUTED: executed, **({LAST: obs} if ended else {})}
         return obs, float(reward), terminated, truncated, info
 
 

@@ -19,6 +19,7 @@ from .steps import lost_steps
 GRAVITY = 9.81  # m/s^2
 _EPISODES = 1000  # whose goals say where goals lie
 EXECUTED = "executed_action"  # in an info: what was done in place of the action given
+GIVEN = "given_action"  # in an info beside it: which action that was
 
 
 class EpisodeReplayBuffer(RecordReplayBuffer):
@@ -61,14 +62,14 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         whose steps were not all stored (`lost_steps`).
 
         Raises:
-            ValueError: an array has another shape than the environments', or holds NaN or infinity;
-                nothing of the step is stored.
+            ValueError: an array has another shape than the environments', or holds NaN or infinity,
+                or a wrapper changed the action before it was replaced; nothing is stored.
         """
         if self.n_added == 0:
             self.check_size()
         next_obs = self._with_last_observations(next_obs, done, infos)
         if EXECUTED in infos[0]:
-            action = self._scaled(np.stack([info[EXECUTED] for info in infos]))
+            action = self._executed(action, infos)
         pos = self.pos
         rows = [
             self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
@@ -121,6 +122,18 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
                 for key, value in last.items():
                     next_obs[key][env_idx] = value
         return next_obs
+
+    def _executed(self, chosen: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
+        """Return what was executed in place of the actions chosen, both scaled (n_envs, d)."""
+        if GIVEN in infos[0]:
+            given = self._scaled(np.stack([info[GIVEN] for info in infos]))
+            if not np.allclose(given, chosen, rtol=0.0, atol=1e-4):
+                raise ValueError(
+                    "a wrapper outside of ReachFirstWrapper changes the actions on their way to "
+                    "it, so what it tells to have executed is none of the policy's: put "
+                    "ReachFirstWrapper outside of that wrapper"
+                )
+        return self._scaled(np.stack([info[EXECUTED] for info in infos]))
 
     def _scaled(self, actions: np.ndarray) -> np.ndarray:
         """Scale an environment's actions (n_envs, action_dim) to [-1, 1], as they are stored."""

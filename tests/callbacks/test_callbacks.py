@@ -12,7 +12,7 @@ import toy
 from imagined import N, bare, imagining, learner
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
 from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
@@ -244,6 +244,25 @@ def test_a_loaded_model_goes_on_at_its_k_max_with_a_test_env(tmp_path: Path) -> 
     loaded.learn(10, callback=CurriculumCallback(imagining(begun, "test"), N))
     assert begun.k_max == 6
     assert loaded.curriculum_state["k_max"] == 6
+
+
+@pytest.mark.parametrize("face", ["VecEnv", "gymnasium"])
+def test_a_new_model_begins_at_the_first_level_where_another_has_trained(face: str) -> None:
+    def make_curriculum() -> toy.Curriculum:
+        return toy.curriculum(threshold=0.0, k_max=3, p=0.0)
+
+    def make() -> ImaginedGoalWrapper:
+        return ImaginedGoalWrapper(toy.PointEnv(), toy.StraightPredictor(), make_curriculum())
+
+    env: Any = imagining(make_curriculum()) if face == "VecEnv" else DummyVecEnv([make] * N)
+    for _ in range(2):
+        tested = env.curriculum if face == "VecEnv" else make_curriculum()
+        shown = Watch(lambda model: [info["imagined_level"] for info in model.ep_info_buffer])
+        callback = CurriculumCallback(imagining(tested, "test"), N)
+        model = learner(VecMonitor(env, info_keywords=("imagined_level",)))
+        model.learn(20 * N * toy.HORIZON, callback=[callback, shown])
+        assert len(shown.seen[0]) == N and set(shown.seen[0]) <= {1, 2, 3}
+        assert not set(shown.seen[-1]) <= {1, 2, 3}, "it advances"
 
 
 def test_learning_again_counts_anew_and_tests_an_episode_of_every_copy(tmp_path: Path) -> None:

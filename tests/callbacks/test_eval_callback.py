@@ -154,3 +154,8 @@ def test_bad_evaluation_settings_are_refused(options: dict[str, int]) -> None:
 def test_an_evaluation_in_vec_normalize_is_refused() -> None:
     with pytest.raises(ValueError, match="eval_env is in VecNormalize"):
         OriginalGoalEvalCallback(VecNormalize(bare()), 1, 1)
+
+
+def test_an_evaluation_that_would_show_imagined_goals_is_refused() -> None:
+    with pytest.raises(ValueError, match="eval_env imagines goals"):
+        OriginalGoalEvalCallback(imagining(toy.curriculum()), 1, 1)

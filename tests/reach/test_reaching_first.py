@@ -11,7 +11,14 @@ import pytest
 import toy
 from gymnasium.wrappers import RescaleAction
 from reaching import HORIZON, REACH, TASK, ReachToyEnv, StraightActor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
+from stable_baselines3 import DDPG
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecEnv,
+    VecEnvWrapper,
+    VecMonitor,
+    VecNormalize,
+)
 
 from sb3_follow_object.envs import make_vec
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
@@ -19,6 +26,7 @@ from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
 from sb3_follow_object.reach.approach import BEHIND
 from sb3_follow_object.reach.vec_env import ReachFirstVecEnv
 from sb3_follow_object.reach.wrapper import ReachFirstWrapper
+from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
 
 PUSH, PICK = "FollowObject/PushSideGap-v0", "FollowObject/PnPSimpleV1-v0"
 QUIET: dict[str, Any] = {**REACH, "noise": 0.0}
@@ -352,3 +360,31 @@ def test_what_cannot_be_meant_is_one_sentence(
 def test_normalised_observations_are_refused() -> None:
     with pytest.raises(ValueError, match="put it inside VecNormalize, not around it"):
         ReachFirstVecEnv(VecNormalize(DummyVecEnv([ReachToyEnv])))
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_actions_that_are_changed_on_their_way_to_reaching_are_refused(face: str) -> None:
+    class Halved(VecEnvWrapper):
+        def reset(self) -> Any:
+            return self.venv.reset()
+
+        def step_async(self, actions: np.ndarray) -> None:
+            self.venv.step_async(0.5 * actions)
+
+        def step_wait(self) -> Any:
+            return self.venv.step_wait()
+
+    for env in (FACES[face](share=0.0), Halved(FACES[face](share=0.0))):
+        model = DDPG(
+            "MultiInputPolicy",
+            env,
+            replay_buffer_class=FollowObjectReplayBuffer,
+            seed=0,
+            train_freq=HORIZON,
+            policy_kwargs={"net_arch": [8]},
+        )
+        if isinstance(env, Halved):
+            with pytest.raises(ValueError, match="put ReachFirstWrapper outside of that wrapper"):
+                model.learn(3)
+        else:
+            model.learn(3 * HORIZON)
