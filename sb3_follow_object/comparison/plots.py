@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
 
 from ..common.extras import need
 from ..common.files import atomic_write
-from ..runs.run_folder import EVALUATIONS
+from ..runs.run_folder import EVALUATIONS, flat
 from ..settings.presets import load_config
 
 X_AXES = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time (minutes)", 60.0)}
@@ -30,11 +32,13 @@ class Curve:
         method: its name.
         columns: arrays (n,) of env_steps, wall_s, success_rate and, where imagined goals were
             shown, k_max.
+        settings: what it was trained with, by dotted names.
     """
 
     task: str
     method: str
     columns: dict[str, np.ndarray]
+    settings: dict[str, Any] = field(default_factory=dict)
 
 
 def read_curve(folder: str | os.PathLike[str]) -> Curve:
@@ -56,7 +60,7 @@ def read_curve(folder: str | os.PathLike[str]) -> Curve:
         columns = {name: np.array([float(row[name]) for row in rows]) for name in names}
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not a file of evaluations ({error})") from error
-    return Curve(config.env_id, config.method, columns)
+    return Curve(config.env_id, config.method, columns, flat(config.settings))
 
 
 def spread(curves: Sequence[Curve], x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
@@ -79,8 +83,29 @@ def spread(curves: Sequence[Curve], x: str, y: str) -> tuple[np.ndarray, np.ndar
     return points, np.quantile(values, [0.25, 0.5, 0.75], axis=0)
 
 
+def by_settings(curves: Sequence[Curve]) -> dict[str, list[Curve]]:
+    """Return runs of one method and task by the settings in which they differ, in words.
+
+    Args:
+        curves: of one method and task; those that differ in nothing come under "".
+    """
+    names = dict.fromkeys(name for curve in curves for name in curve.settings)
+    names.pop("n_threads", None)  # changes no result
+    differ = [
+        name for name in names if len({repr(curve.settings.get(name, "")) for curve in curves}) > 1
+    ]
+    groups: dict[str, list[Curve]] = {}
+    for curve in curves:
+        own = [name for name in differ if name in curve.settings]
+        words = ", ".join(f"{name}={json.dumps(curve.settings[name])}" for name in own)
+        groups.setdefault(words, []).append(curve)
+    return groups
+
+
 def draw_curves(folders: Sequence[str | os.PathLike[str]], out: str | os.PathLike[str]) -> None:
-    """Draw runs in one figure: a line a method and task, median and quartiles over seeds.
+    """Draw runs in one figure: a line a method, task and choice of settings, over the seeds.
+
+    Lines are medians, with quartiles around them.
 
     Args:
         folders: of the runs, >= 1.
@@ -102,9 +127,11 @@ def draw_curves(folders: Sequence[str | os.PathLike[str]], out: str | os.PathLik
     figure = figure_module.Figure(figsize=(10, 3.2 * len(shown)), layout="constrained")
     axes = figure.subplots(len(shown), len(X_AXES), squeeze=False)
     for (task, method), group in sorted(groups.items()):
-        label = method if len(tasks) == 1 else f"{task} {method}"
-        label += f" ({len(group)} runs)" if len(group) > 1 else ""
-        _draw_group(axes, shown, group, label)
+        for settings, alike in sorted(by_settings(group).items()):
+            label = method if len(tasks) == 1 else f"{task} {method}"
+            label += f" {shorten(settings, 60)}" if settings else ""
+            label += f" ({len(alike)} runs)" if len(alike) > 1 else ""
+            _draw_group(axes, shown, alike, label)
     for row, y in zip(axes, shown, strict=True):
         for axis, (name, _) in zip(row, X_AXES.values(), strict=True):
             axis.xaxis.set_major_formatter(ticker.EngFormatter(sep=""))
@@ -112,7 +139,7 @@ def draw_curves(folders: Sequence[str | os.PathLike[str]], out: str | os.PathLik
             if y == "success_rate":
                 axis.set_ylim(-0.02, 1.02)
             axis.grid(alpha=0.3)
-    axes[0][0].legend()
+    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center")
     if len(tasks) == 1:
         figure.suptitle(tasks[0])
     save_png(figure, out, dpi=120)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
-from sb3_follow_object.comparison.plots import draw_curves, read_curve, spread
+from sb3_follow_object.comparison.plots import by_settings, draw_curves, read_curve, spread
 from sb3_follow_object.runs.run_folder import CONFIG, EVALUATIONS
 from sb3_follow_object.settings.run_config import RunConfig
 
@@ -18,9 +19,12 @@ TASK = "FollowObject/PnPShelf-v0"
 PNG = b"\x89PNG"
 
 
-def run_folder(path: Path, success: list[float], method: str = "fo", step: int = 100) -> Path:
+def run_folder(
+    path: Path, success: list[float], method: str = "fo", step: int = 100, **settings: Any
+) -> Path:
     path.mkdir()
-    (path / CONFIG).write_text(json.dumps(asdict(RunConfig(TASK, method))))
+    config = RunConfig(TASK, method, settings=settings)
+    (path / CONFIG).write_text(json.dumps(asdict(config)))
     rows = [",".join(OriginalGoalEvalCallback.COLUMNS)]
     for i, rate in enumerate(success, start=1):
         k_max = i if method == "fo" else ""
@@ -64,6 +68,21 @@ def test_figure_is_written(tmp_path: Path, methods: list[str]) -> None:
     ]
     draw_curves(folders, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").read_bytes().startswith(PNG)
+
+
+def test_runs_with_other_settings_are_lines_of_their_own(tmp_path: Path) -> None:
+    curves = [
+        read_curve(run_folder(tmp_path / name, [0.1, 0.3], n_envs=16, **settings))
+        for name, settings in {
+            "preset": {"reach": {}},
+            "seed 1, on two threads": {"reach": {}, "n_threads": 2},
+            "without": {"reach": None},
+            "another tau": {"reach": {}, "algorithm": {"tau": 0.05}},
+        }.items()
+    ]
+    found = {words: len(group) for words, group in by_settings(curves).items()}
+    assert found == {"": 2, "reach=null": 1, "algorithm.tau=0.05": 1}
+    assert list(by_settings(curves[:2])) == [""]
 
 
 def test_folder_without_validations_is_refused(tmp_path: Path) -> None:
