@@ -2,8 +2,8 @@
 
     python benchmarks/ablations.py runs/ab-*
 
-Writes benchmarks/ablations.csv, where a row of the same task, seed and setting is replaced and the
-others stay: a row a run with what differs, when the curriculum passed each
+Writes benchmarks/ablations.csv, where a row of the same task, method, seed and setting is replaced
+and the others stay: a row a run with what differs, when the curriculum passed each
 fifth of its levels, when 0.9 of the validation episodes first succeeded, and the final test. Prints
 it as Markdown. Runs need not be finished: the final test is then empty.
 """
@@ -17,6 +17,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
+import sb3_follow_object.envs  # noqa: F401  (registers the ids)
 from sb3_follow_object.settings.presets import run_config
 
 OUT = Path(__file__).with_name("ablations.csv")
@@ -65,9 +68,10 @@ def read_row(run: Path) -> dict[str, Any]:
         result = json.loads((run / "result.json").read_text())
     levels = config["settings"].get("curriculum", {}).get("n_levels", 25)
     if config["settings"].get("curriculum", {}).get("levels") != "path":
-        levels = 50
+        levels = gym.spec(config["env_id"]).max_episode_steps or 50
     return {
         "task": config["env_id"].removeprefix("FollowObject/").removesuffix("-v0"),
+        "method": config["method"],
         "seed": str(config["seed"]),
         "setting": difference(config),
         **{f"k_{share}": first("k_max", share / 100 * levels) for share in (20, 40, 60, 80, 100)},
@@ -86,12 +90,20 @@ def main() -> None:
     kept: list[dict[str, Any]] = []
     if OUT.exists():
         with open(OUT, newline="") as file:
-            kept = list(csv.DictReader(file))
+            kept = [{"task": row["task"], "method": "fo", **row} for row in csv.DictReader(file)]
     kept += [read_row(run) for run in parser.parse_args().runs]
-    by_run = {(row["task"], row["setting"], row["seed"]): row for row in kept}
+    by_run = {
+        tuple(row[name] for name in ("task", "method", "setting", "seed")): row for row in kept
+    }
     rows = sorted(
         by_run.values(),
-        key=lambda row: (row["task"], row["setting"] != "default", row["setting"], row["seed"]),
+        key=lambda row: (
+            row["task"],
+            row["method"],
+            row["setting"] != "default",
+            row["setting"],
+            row["seed"],
+        ),
     )
     with open(OUT, "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")

@@ -70,6 +70,8 @@ def read_row(run: Path) -> Row:
         row |= json.loads((run / "result.json").read_text())
     elif row["validations"]:
         row |= {k: row["validations"][-1].get(k) for k in ("env_steps", "object_steps", "wall_s")}
+    if "task" not in row:
+        raise ValueError(f"{run} has neither config.json nor result.json: it was broken off")
     return {**row, "task": row["task"].rpartition(":")[2]}
 
 

@@ -12,12 +12,13 @@ import runpy
 import sys
 import traceback
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from .common.extras import need
 from .ddpg.her_ddpg import HerDDPG
 from .settings.fields import check_names
-from .settings.presets import preset_file
+from .settings.presets import preset_file, read_yaml
 
 ALGORITHM = "her_ddpg"
 COMMANDS = ("train", "enjoy", "record_video", "load_from_hub", "push_to_hub")
@@ -152,6 +153,7 @@ def _check(arguments: Sequence[str]) -> argparse.Namespace:
     for name in ("--storage", "--study-name"):
         parser.add_argument(name)
     parser.add_argument("--trial-id", type=int)
+    parser.add_argument("-conf", "--conf-file", type=Path)
     try:
         given, _ = parser.parse_known_args(arguments)
     except Exception as error:  # rl_zoo3 evaluates what is given
@@ -168,6 +170,13 @@ def _check(arguments: Sequence[str]) -> argparse.Namespace:
         raise ValueError("--log-interval is 0; give episodes, or -2 for no log")
     if given.trial_id is not None:
         _check_trial(given)
+    if given.conf_file is not None and given.conf_file.suffix in (".yml", ".yaml"):
+        for env_id, entry in read_yaml(given.conf_file).items():
+            if not isinstance(entry, dict):
+                raise ValueError(f"{given.conf_file}: the settings of {env_id!r} are not a mapping")
+    n_envs = (given.hyperparams or {}).get("n_envs", 1)
+    if not isinstance(n_envs, int) or n_envs < 1:
+        raise ValueError(f"n_envs is {n_envs!r}; give a whole number of 1 or more")
     return given
 
 

@@ -23,17 +23,6 @@ from .streams import leave_streams, open_streams
 if TYPE_CHECKING:
     from ..settings.run_config import RunConfig
 
-# Settings that only runs with imagined goals read.
-_OF_IMAGINED = (
-    "curriculum",
-    "predictor_fit",
-    "n_paths",
-    "test_every",
-    "n_test_episodes",
-    "store_tests",
-)
-# Settings of the object's stage, in runs that begin with one.
-_OF_OBJECT = ("object_", "inverse_fit", "predictor_fit")
 INTERRUPTED = 130
 
 
@@ -149,7 +138,7 @@ def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> Non
 
 def _config(args: argparse.Namespace) -> RunConfig:
     """Return the configuration that the flags describe."""
-    from ..comparison.cells import needs_object_stage
+    from ..comparison.cells import unread
     from ..settings.presets import parse_override, run_config
 
     if args.env is None:
@@ -166,14 +155,8 @@ def _config(args: argparse.Namespace) -> RunConfig:
         overrides=overrides | dict(parse_override(text) for text in args.set),
     )
     for text in args.set:
-        if text.split("=")[0].split(".")[0] in _OF_IMAGINED and not config.settings["imagine"]:
-            raise ValueError(
-                f"--set {text} does nothing: method {config.method!r} imagines no goals"
-            )
-        if text.startswith(_OF_OBJECT) and not needs_object_stage(config):
-            raise ValueError(
-                f"--set {text} does nothing: method {config.method!r} has no object's stage"
-            )
+        if why := unread(text.split("=")[0], config):
+            raise ValueError(f"--set {text} does nothing: {why}")
     return config
 
 

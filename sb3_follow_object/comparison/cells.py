@@ -15,8 +15,12 @@ from ..runs.object_stage_files import OBJECT_STAGE
 from ..runs.run_folder import CONFIG, RESULT, claim
 from ..settings.presets import load_config
 from ..settings.run_config import RunConfig
+from ..settings.stages import StageSettings
 
 OBJECT = "object"  # folder of the object stages that runs share
+# Settings that only runs with imagined goals read, and those that decide F_phi.
+_OF_IMAGINED = ("curriculum", "test_every", "n_test_episodes", "store_tests")
+_OF_PREDICTOR = ("predictor_fit", "n_paths")
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,20 @@ def needs_object_stage(config: RunConfig) -> bool:
     """Whether a run begins with what its object learns alone."""
     algorithm = config.settings.get("algorithm") or {}
     return bool(config.settings.get("imagine", True)) or reads_object_networks(algorithm)
+
+
+def unread(setting: str, config: RunConfig) -> str | None:
+    """Return why a setting, by its dotted name, does nothing in a run; None where it is read."""
+    first = setting.partition(".")[0]
+    imagines, begins = bool(config.settings.get("imagine", True)), needs_object_stage(config)
+    # F_phi is fitted to tell how rough the object's ways are where it is not for imagined goals.
+    judged = config.settings.get("object_error", StageSettings.object_error) > 0.0
+    fitted = imagines or (begins and judged)
+    if (first in _OF_IMAGINED and not imagines) or (first in _OF_PREDICTOR and not fitted):
+        return f"method {config.method!r} imagines no goals"
+    if not begins and (first.startswith("object_") or first == "inverse_fit"):
+        return f"method {config.method!r} has no object's stage"
+    return None
 
 
 def stage_settings(config: RunConfig) -> dict[str, Any]:

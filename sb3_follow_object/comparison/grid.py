@@ -19,7 +19,7 @@ from ..runs.run_folder import CONFIG, difference
 from ..settings.methods import METHODS
 from ..settings.presets import load_config, run_config
 from ..settings.run_config import RunConfig
-from .cells import Cell, Settings, file_name, is_empty, task_name
+from .cells import Cell, Settings, file_name, is_empty, task_name, unread
 from .ledger import check_settings
 
 # A run's share of the machine; what it learns does not hang on it but for rounding.
@@ -58,20 +58,35 @@ def plan(
         if method not in METHODS:
             raise ValueError(f"there is no method {method!r}{did_you_mean(method, METHODS)}")
     ids = {task_name(env_id): env_id for env_id in map(_env_id, tasks)}
+    for name in settings.overrides or {}:
+        if not any(
+            name in (_read_by(env_id, method, settings).overrides or {})
+            for env_id in ids.values()
+            for method in methods
+        ):
+            raise ValueError(f"--set {name} does nothing: none of {', '.join(methods)} reads it")
     check_settings(folder, settings)
     cells = []
     for seed in dict.fromkeys(seeds):
         for task, env_id in ids.items():
             for method in dict.fromkeys(methods):
-                config = _config(env_id, method, seed, settings, threads)
+                read = _read_by(env_id, method, settings)
+                config = _config(env_id, method, seed, read, threads)
                 path = folder / f"{file_name(task)}-{method}-{seed}"
-                command = _command(path, config, settings)
+                command = _command(path, config, read)
                 cell = Cell(path, task, config, command)
                 kept = _kept_config(cell)
                 if kept is not None:
-                    cell = replace(cell, config=kept, command=_command(path, kept, settings))
+                    cell = replace(cell, config=kept, command=_command(path, kept, read))
                 cells.append(cell)
     return cells
+
+
+def _read_by(env_id: str, method: str, settings: Settings) -> Settings:
+    """Return the settings without the overrides that a method does not read."""
+    config = _config(env_id, method, 0, settings, 1)
+    read = {n: v for n, v in (settings.overrides or {}).items() if unread(n, config) is None}
+    return replace(settings, overrides=read)
 
 
 def _env_id(task: str) -> str:

@@ -92,13 +92,20 @@ def check_settings(folder: Path, settings: Settings) -> None:
     if kept is None:
         return
     wanted = _plain(settings)
-    different = difference({name: kept.get(name) for name in wanted}, wanted)
+    different = difference({n: _told(kept.get(n)) for n in wanted}, _told(wanted))
     if different is not None:
         name, old, new = different
         raise ValueError(
             f"{folder} was compared with {name} {old!r}, not {new!r}; use the same settings or "
             "another folder"
         )
+
+
+def _told(value: Any) -> Any:
+    """Return settings that tell null from what is not set."""
+    if isinstance(value, dict):
+        return {name: _told(inner) for name, inner in value.items()}
+    return "null" if value is None else value
 
 
 def _plain(settings: Settings) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from ..common.extras import need
 from ..common.files import atomic_write
 from ..runs.run_folder import EVALUATIONS, flat
 from ..settings.presets import load_config
+from .results import words_apart
 
 X_AXES = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time (minutes)", 60.0)}
 _Y = {"success_rate": "success on original goals", "k_max": "k_max"}
@@ -89,16 +89,10 @@ def by_settings(curves: Sequence[Curve]) -> dict[str, list[Curve]]:
     Args:
         curves: of one method and task; those that differ in nothing come under "".
     """
-    names = dict.fromkeys(name for curve in curves for name in curve.settings)
-    names.pop("n_threads", None)  # changes no result
-    differ = [
-        name for name in names if len({repr(curve.settings.get(name, "")) for curve in curves}) > 1
-    ]
     groups: dict[str, list[Curve]] = {}
-    for curve in curves:
-        own = [name for name in differ if name in curve.settings]
-        words = ", ".join(f"{name}={json.dumps(curve.settings[name])}" for name in own)
-        groups.setdefault(words, []).append(curve)
+    words = words_apart([curve.settings for curve in curves])
+    for curve, its_words in zip(curves, words, strict=True):
+        groups.setdefault(its_words, []).append(curve)
     return groups
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ import numpy as np
 from ..common.extras import MissingExtra
 from ..common.files import atomic_write
 from ..envs import TASKS
-from ..runs.run_folder import CONFIG, RESULT, read_result, trained_steps
+from ..runs.run_folder import CONFIG, RESULT, flat, read_result, trained_steps
 from ..settings.methods import METHODS
 from ..settings.presets import load_config
 from .cells import task_name
@@ -103,6 +105,8 @@ class Group:
 def read_results(folder: str | os.PathLike[str]) -> list[Run]:
     """Read a folder of run folders, and the runs that its grid file names beside them.
 
+    Where runs of a task and method differ in settings, their methods are told apart by them.
+
     Raises:
         ValueError: it holds no runs, or a file of a run is damaged.
     """
@@ -123,7 +127,37 @@ def read_results(folder: str | os.PathLike[str]) -> list[Run]:
             runs[name] = Run(*place, status=status, error=error)
     if not runs:
         raise ValueError(f"{folder} holds no runs: no folder in it has a {CONFIG}")
-    return sorted(runs.values(), key=lambda run: (run.task, run.method, run.seed))
+    return sorted(_told_apart(runs.values()), key=lambda run: (run.task, run.method, run.seed))
+
+
+def words_apart(settings: Sequence[dict[str, Any]]) -> list[str]:
+    """Return, for each of several runs' settings, those in which they differ, in words.
+
+    Args:
+        settings: by dotted names; "" for those that lack what others have.
+    """
+    names = dict.fromkeys(name for each in settings for name in each)
+    names.pop("n_threads", None)  # changes no result
+    differ = [name for name in names if len({repr(each.get(name, "")) for each in settings}) > 1]
+    return [
+        ", ".join(f"{name}={json.dumps(each[name])}" for name in differ if name in each)
+        for each in settings
+    ]
+
+
+def _told_apart(runs: Iterable[Run]) -> list[Run]:
+    """Return runs whose methods say in which settings they differ from others of theirs."""
+    told = []
+    alike: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        alike.setdefault((run.task, run.method), []).append(run)
+    for (_, method), group in alike.items():
+        begun = [run for run in group if (run.folder / CONFIG).exists()]
+        words = words_apart([flat(load_config(run.folder).settings) for run in begun])
+        pairs = zip(begun, words, strict=True)
+        names = {run.folder: f"{method} ({shorten(differ, 60)})" for run, differ in pairs if differ}
+        told += [replace(run, method=names.get(run.folder, method)) for run in group]
+    return told
 
 
 def group_runs(

@@ -60,7 +60,8 @@ class AuxiliaryReward(nn.Module):
     """A reward that `HerDDPG` learns beside the environment's.
 
     A subclass computes it in `forward` and may learn from each batch in `update`. What changes
-    belongs into parameters, buffers and `optimizer`, which are saved with the algorithm.
+    belongs into parameters, buffers and `optimizer`, which are saved with the algorithm. It is made
+    with what the settings say and with ``n_features``, the length of `Transitions.features`.
 
     Attributes:
         name: of the method; logged values begin with it.
@@ -219,7 +220,12 @@ def reward_class(settings: Mapping[str, Any]) -> type[AuxiliaryReward]:
         return chosen
     if not issubclass(name, AuxiliaryReward):
         raise ValueError(f"auxiliary: {name.__name__} is no subclass of AuxiliaryReward")
-    known = sorted({*inspect.signature(name.__init__).parameters} - {"self", *_GIVEN})
+    arguments = inspect.signature(name.__init__).parameters
+    takes_any = any(each.kind is each.VAR_KEYWORD for each in arguments.values())
+    lacking = [] if takes_any else [given for given in _GIVEN if given not in arguments]
+    if lacking:
+        raise ValueError(f"auxiliary: {name.__name__} must take the argument {lacking[0]!r}")
+    known = sorted({*arguments} - {"self", *_GIVEN})
     check_names(_options(settings), known, f"auxiliary ({name.name})")
     return name
 

@@ -92,13 +92,18 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
         self.policy.load_state_dict(state["policy"])
         self.actor.optimizer.load_state_dict(state["actor_optimizer"])
         self.critic.optimizer.load_state_dict(state["critic_optimizer"])
+        for optimizer in (self.actor.optimizer, self.critic.optimizer):
+            for group in optimizer.param_groups:
+                group["capturable"] = False  # of graphs on CUDA, which set it themselves
         if self.auxiliary_critic is not None:
             self.auxiliary_critic.load_training_state(state["auxiliary"])
         assert self.replay_buffer is not None
         self.moments.load_state_dict(state["moments"], self.replay_buffer)
         self.rng.bit_generator.state = state["rng"]
         if self._device_replay is not None and state["device_rng"] is not None:
-            self._device_replay.generator.set_state(state["device_rng"])
+            generator, saved = self._device_replay.generator, state["device_rng"]
+            if saved.shape == generator.get_state().shape:  # not of another kind of device
+                generator.set_state(saved)
         self._last_obs = state["last_obs"]
         self._last_episode_starts = np.ones(self.n_envs, dtype=bool)
         for name in self._COUNTERS:

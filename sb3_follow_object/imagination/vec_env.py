@@ -169,6 +169,7 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
             "shown": self._shown.copy(),
             "original": self._original.copy(),
             "level": self._level.copy(),
+            "start": self._start.copy(),
             "rng": copy.deepcopy(self._rng.bit_generator.state),
         }
         if self.predictor.context:
@@ -180,7 +181,8 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
     def set_state(self, state: dict[str, Any]) -> None:
         """Continue from ``get_state`` of a wrapper of the same size."""
         contexts = ("contexts",) if self.predictor.context else ()
-        for name in ("shown", "original", "level", *contexts):
+        starts = ("start",) if "start" in state else ()  # states of before 0.2.0 had none
+        for name in ("shown", "original", "level", *starts, *contexts):
             current, saved = getattr(self, f"_{name}"), np.asarray(state[name])
             if saved.shape != current.shape:
                 raise ValueError(

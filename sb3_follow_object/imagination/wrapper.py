@@ -114,8 +114,9 @@ class ImaginedGoalWrapper(
         self._original = obs["desired_goal"].copy()
         self._shown, self._level = self._original, 0
         self._start = np.array(obs["achieved_goal"], dtype=np.float64)
-        if self.active:
+        if self.active or isinstance(self._predictor, GoalPredictor):
             self._context = read_context(self.predictor.context, self.env)
+        if self.active:
             shown, level = self._draw(obs["achieved_goal"][None], obs["desired_goal"][None])
             with np.errstate(under="ignore"):
                 self._shown, self._level = shown[0].astype(self._dtype), int(level[0])

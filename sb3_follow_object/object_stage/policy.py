@@ -141,6 +141,7 @@ def train_object_policy(
     test_env: VecEnv,
     total_timesteps: int = StageSettings.object_timesteps,
     *,
+    give_up_after: int | None = None,
     n_test_episodes: int = StageSettings.object_test_episodes,
     test_every: int = StageSettings.object_test_every,
     success_rate: float = StageSettings.object_success,
@@ -157,6 +158,7 @@ def train_object_policy(
         env: vectorised object-only environment, e.g. of FollowObject/PnPShelfObject-v0.
         test_env: fresh copies of it.
         total_timesteps: env steps after which training ends unsolved; tests are counted.
+        give_up_after: the same for a task that has never been solved until then, if sooner.
         n_test_episodes: episodes a test, >= 1.
         test_every: training episodes of each copy between two tests, >= 1.
         success_rate: noise-free success that counts as solved, in two tests in a row.
@@ -177,8 +179,11 @@ def train_object_policy(
     callbacks = CallbackList([solved, *([callback(solved)] if callback else [])])
 
     def learn(begins: bool) -> None:
+        limits = [total_timesteps]
+        if give_up_after is not None and not solved.learns_on:
+            limits.append(give_up_after)
         model.learn(
-            total_timesteps - model.num_timesteps,
+            min(limits) - model.num_timesteps,
             callback=callbacks,
             log_interval=None,  # type: ignore[arg-type]
             reset_num_timesteps=begins,

@@ -245,7 +245,6 @@ class ObjectStage:
         for trial in range(notes.get("trial", 0), len(choices)):
             self.on_table = choices[trial]
             last = trial == len(choices) - 1
-            total = settings["object_timesteps"]
 
             def noting(
                 solved: StopWhenSolved, trial: int = trial, spent: int = spent
@@ -258,7 +257,8 @@ class ObjectStage:
             model, solved = train_object_policy(
                 env,
                 test_env,
-                total if last else min(total, SURFACE_STEPS),
+                settings["object_timesteps"],
+                give_up_after=None if last else SURFACE_STEPS,
                 n_test_episodes=settings["object_test_episodes"],
                 test_every=settings["object_test_every"],
                 success_rate=settings["object_success"],

@@ -75,11 +75,20 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
             self.table.row_of(int(self.ep_start[pos, env_idx]), int(env_idx))
             for env_idx in self.ep_length[pos].nonzero()[0]
         ]
+        # Until the step has been taken, the episode that it overwrites is there.
+        kept = (
+            [(store[pos], store[pos].copy()) for store in self._stores().values()] if rows else []
+        )
+        try:
+            # What is too small for float32 becomes 0, what is too large is refused.
+            with np.errstate(under="ignore", over="ignore"):
+                self._write(obs, next_obs, action, reward, done, infos)
+        except ValueError:
+            for slot, content in kept:
+                slot[...] = content
+            raise
         for row in sorted(rows):
             self._forget_episode(row)
-        # What is too small for float32 becomes 0, what is too large is refused.
-        with np.errstate(under="ignore", over="ignore"):
-            self._write(obs, next_obs, action, reward, done, infos)
         running = self._current_ep_start != pos
         if running.any():
             self.end_episodes(self._broken_off(running))

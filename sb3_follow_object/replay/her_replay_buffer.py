@@ -189,6 +189,8 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         """Let what F_phi sees of other things' places be stored, where it will be asked."""
         if self.imagined_ratio > 0.0:
             context = imagination_of(env, IMAGINED_RATIO)[0].context
+            if context:
+                env.get_attr("predictor")  # each wrapper tells its context once it has one
             shape = (self.buffer_size, self.n_envs, len(context))
             self.contexts = np.zeros(shape, dtype=np.float32)
 

@@ -49,6 +49,33 @@ def test_command_trains_the_same_run(tmp_path: Path) -> None:
     assert f"{words} n_eval_episodes=380 curriculum.p=0.5" in cell.command
 
 
+def test_a_run_has_only_what_its_method_reads(tmp_path: Path) -> None:
+    overrides = {"curriculum.p": 0.5, "object_n_envs": 3, "n_paths": 64, "learning_starts": 500}
+    cells = plan(
+        tmp_path, ["PnPShelf"], ["fo", "sldr", "her"], [0], Settings(1000, overrides=overrides)
+    )
+    read = {
+        cell.method: [name for name in overrides if f"{name}=" in cell.command] for cell in cells
+    }
+    assert read == {
+        "fo": list(overrides),
+        "sldr": ["object_n_envs", "n_paths", "learning_starts"],
+        "her": ["learning_starts"],
+    }
+    for cell in cells:
+        arguments = make_parser(_COMMANDS).parse_args(shlex.split(cell.command)[1:])
+        assert _config(arguments) == cell.config
+    with pytest.raises(ValueError, match=r"curriculum.p does nothing: none of her, rnd reads it"):
+        plan(tmp_path, ["PnPShelf"], ["her", "rnd"], [0], Settings(1000, overrides=overrides))
+
+
+def test_null_is_another_setting_than_none_at_all(tmp_path: Path) -> None:
+    Ledger(tmp_path, SETTINGS, plan(tmp_path, ["PnPShelf"], ["fo"], [0], SETTINGS))
+    other = Settings(1000, overrides={"n_envs": 2, "n_test_episodes": None})
+    with pytest.raises(ValueError, match=r"set\.n_test_episodes"):
+        plan(tmp_path, ["PushSideGap"], ["fo"], [0], other)
+
+
 @pytest.mark.parametrize("preset", ["default", "paper"])
 @pytest.mark.parametrize("steps", [None, 1000])
 def test_command_says_all_settings_of_its_run(

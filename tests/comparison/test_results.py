@@ -56,6 +56,13 @@ def test_runs_have_their_status(results: Path) -> None:
     }
 
 
+def test_runs_of_other_settings_are_no_seeds_of_one_method(tmp_path: Path) -> None:
+    for seed, settings in enumerate(({}, {"n_threads": 2}, {"n_envs": 4}, {"n_envs": 4})):
+        write_run(tmp_path, "PnPShelf", "fo", seed, 0.5, **settings)
+    groups = group_runs(read_results(tmp_path))
+    assert [(g.method, len(g.runs)) for g in groups] == [("fo", 2), ("fo (n_envs=4)", 2)]
+
+
 def test_markdown_table_leaves_nothing_out(results: Path) -> None:
     text = markdown_table(group_runs(read_results(results)))
     assert "| PnPShelf | 0.40 [0.30, 0.65] (3) | 0.10 (1); 1 failed, 1 not run |" in text

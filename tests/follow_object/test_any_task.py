@@ -314,3 +314,22 @@ def test_longer_episodes_have_as_many_updates_and_tests_an_env_step(method: str)
     assert paper[0].settings["algorithm"] == paper[1].settings["algorithm"]
     given = run_config("Longer-v0", method=method, overrides={"gradient_steps": 7})
     assert given.settings["algorithm"]["gradient_steps"] == 7
+
+
+def test_an_object_that_learns_on_may_take_more_than_a_surface_is_given(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(stages, "SURFACE_STEPS", 600)
+    rough = {"object_success": 0.0, "object_error": 1e-6}  # any two tests solve it
+    often = {"object_n_envs": 2, "object_test_every": 1, "object_test_episodes": 2}
+    settings = {**TINY, "object_timesteps": 1200, **rough, **often}
+    said: list[str] = []
+    states: list[dict[str, Any]] = []
+    stage = FollowObject(ARM, report=said.append, **settings).object_stage
+    predictor = stage.learn_predictor(keeping(states))
+    (steps,) = [int(s.split(" for ")[1].split()[0]) for s in said if "the object learns on" in s]
+    assert steps > 600 and stage.on_table is True
+    assert states[-1]["model"]["counters"]["num_timesteps"] > 600
+    again = FollowObject(ARM, report=quiet, **settings).object_stage
+    resumed = again.learn_predictor(state=states[-1])
+    np.testing.assert_array_equal(resumed.error_mm, predictor.error_mm)

@@ -184,6 +184,20 @@ def test_a_step_that_does_not_fit_is_not_stored(change: Any, sentence: str) -> N
     assert buffer.table.n_transitions() == 9
 
 
+def test_a_step_that_is_refused_leaves_the_episode_that_it_would_overwrite() -> None:
+    buffer = make_buffer(make_env(3), size=6)
+    for value in range(3):  # two slots: the third step overwrites the first
+        step = a_step()
+        step["obs"]["observation"] = np.full((3, 3), float(value))
+        buffer.add(**step)
+    step = a_step()
+    step["next_obs"]["desired_goal"] = np.full((3, 3), np.nan)
+    with pytest.raises(ValueError, match="NaN"):
+        buffer.add(**step)
+    assert buffer.table.n_transitions() == 6
+    assert set(buffer.sample(100).observations["observation"].ravel().tolist()) == {1.0, 2.0}
+
+
 def test_what_float32_cannot_tell_from_zero_is_zero() -> None:
     buffer = make_buffer(make_env(3))
     step = a_step()

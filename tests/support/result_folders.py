@@ -25,11 +25,12 @@ def write_run(
     seed: int,
     success: float | None = None,
     curve: tuple[float, ...] = (0.1, 0.2, 0.4),
+    **settings: Any,
 ) -> Path:
     """Write a run with a learning curve; it is finished where it has a final success."""
     run = folder / f"{task}-{method}-{seed}"
     run.mkdir(parents=True)
-    config = RunConfig(f"FollowObject/{task}-v0", method, seed)
+    config = RunConfig(f"FollowObject/{task}-v0", method, seed, settings=settings)
     (run / CONFIG).write_text(json.dumps(asdict(config)))
     rows = [",".join(OriginalGoalEvalCallback.COLUMNS)]
     for i, rate in enumerate(curve, start=1):
