@@ -19,6 +19,7 @@ from tree import PACKAGES, run
 from sb3_follow_object import zoo
 from sb3_follow_object.envs import TASKS
 from sb3_follow_object.runs.predictor_cache import CACHE_VARIABLE
+from sb3_follow_object.settings.presets import run_config
 
 pytest.importorskip("rl_zoo3")
 
@@ -161,6 +162,17 @@ def test_stock_files_say_what_the_preset_says(file: str) -> None:
             assert entry[key] == preset[key], (name, key)
         given = dict(entry["replay_buffer_kwargs"])
         assert given.pop("n_sampled_goal") == 4 and given == preset["replay_buffer_kwargs"]
+
+
+@pytest.mark.parametrize("env_id", ["FetchPush-v4", "FetchSlide-v4", "FetchPickAndPlace-v4"])
+def test_rl_zoo3_and_train_read_the_same_of_gymnasium_robotics_tasks(env_id: str) -> None:
+    entries = yaml.safe_load((CONFIGS / "fo.yml").read_text())
+    entry = entries.get(env_id, entries["default"])
+    config = run_config(env_id)
+    algorithm = config.settings["algorithm"]
+    assert entry["n_timesteps"] == config.total_timesteps
+    for name in ("replay_buffer_kwargs", "gradient_steps", "batch_size", "policy_kwargs"):
+        assert entry[name] == algorithm[name], name
 
 
 @pytest.mark.parametrize("file", ["ddpg.yml", "sac.yml"])

@@ -248,6 +248,7 @@ def test_a_model_without_normalisation_comes_from_the_hub(
         (["--conf-file", "nothing.yml"], "nothing.yml"),
         (["--gym-packages", "nothing_here"], "nothing_here"),
         (["-params", "policy:MlpPolicy"], "the value is Python"),
+        (["-params", "n_envs:0"], "n_envs is 0; give a whole number of 1 or more"),
         (["-params", "nois_std:0.1"], "did you mean 'noise_std'"),
         (["-params", "normalize:True"], "VecNormalize"),
         (["-params", "frame_stack:2"], "frame_stack"),
@@ -266,6 +267,22 @@ def test_what_cannot_be_meant_is_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     zoo_exits(2, *TRAIN, *arguments)
+    assert sentence in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("a: [1, 2", "is not YAML"),
+        ("[1, 2]", "is not a mapping from environment ids to settings"),
+        ("default: 3", "the settings of 'default' are not a mapping"),
+    ],
+)
+def test_a_file_that_cannot_be_meant_is_one_line(
+    content: str, sentence: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("own.yml").write_text(content)  # the fixture's folder is the current one
+    zoo_exits(2, *TRAIN, "--conf-file", "own.yml")
     assert sentence in capsys.readouterr().err.splitlines()[-1]
 
 
