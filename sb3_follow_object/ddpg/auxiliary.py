@@ -222,6 +222,7 @@ def reward_class(settings: Mapping[str, Any]) -> type[AuxiliaryReward]:
         raise ValueError(f"auxiliary: {name.__name__} is no subclass of AuxiliaryReward")
     arguments = inspect.signature(name.__init__).parameters
     takes_any = any(each.kind is each.VAR_KEYWORD for each in arguments.values())
+    takes_any &= name.__init__ is not nn.Module.__init__  # which refuses what it is given
     lacking = [] if takes_any else [given for given in _GIVEN if given not in arguments]
     if lacking:
         raise ValueError(f"auxiliary: {name.__name__} must take the argument {lacking[0]!r}")

@@ -162,3 +162,39 @@ def test_means_are_of_the_updates_that_had_a_value() -> None:
             critic._log(q_mean=th.tensor(-2.0))
     assert critic.take_log() == {"up/reward": 4.5, "up/q_mean": -2.0}
     assert critic.take_log() == {}
+
+
+def test_a_reward_that_takes_no_features_is_refused_with_what_it_lacks() -> None:
+    class Poor(AuxiliaryReward):
+        name: ClassVar[str] = "poor"
+        reward_range = (0.0, 1.0)
+
+    class Open(Poor):
+        def __init__(self, **given: Any) -> None:
+            super().__init__()
+
+    class Closed(Poor):
+        def __init__(self) -> None:
+            super().__init__()
+
+    for reward in (Poor, Closed):
+        with pytest.raises(
+            ValueError, match=f"{reward.__name__} must take the argument 'n_features'"
+        ):
+            make_model(auxiliary={"name": reward})
+    make_model(auxiliary={"name": Open})
+
+
+def test_a_state_of_graphs_on_cuda_goes_on_without_them() -> None:
+    networks = {"net_arch": [8], "optimizer_kwargs": {"fused": False}}
+    model, other = (make_model(policy_kwargs=networks) for _ in range(2))
+    model.learn(400, log_interval=None)  # type: ignore[arg-type]
+    state = copy.deepcopy(model.training_state())
+    for part in ("actor_optimizer", "critic_optimizer"):
+        for group in state[part]["param_groups"]:
+            group["capturable"] = True
+    other.load_training_state(state)
+    other.replay_buffer.load_state_dict(model.replay_buffer.state_dict())  # type: ignore[union-attr]
+    other.set_logger(model.logger)
+    other.train(1, 16)
+    assert other.policy.actor.optimizer.param_groups[0]["capturable"] is False
