@@ -28,11 +28,13 @@ class Episodes:
 
     Attributes:
         success: (n,) bool, `is_success` at the last step of each episode, for the goal shown.
+        reached: (n,) bool, whether any of its steps said so.
         returns: (n,) float, undiscounted sum of the rewards.
         env_steps: steps simulated, all copies counted, episodes that were not needed included.
     """
 
     success: np.ndarray
+    reached: np.ndarray
     returns: np.ndarray
     env_steps: int
 
@@ -66,8 +68,8 @@ def run_episodes(
     n_envs = venv.num_envs
     wanted = np.array([(n_episodes + i) // n_envs for i in range(n_envs)])
     finished = np.zeros(n_envs, dtype=int)
-    returns_so_far = np.zeros(n_envs)
-    success, returns = [], []
+    returns_so_far, reached_so_far = np.zeros(n_envs), np.zeros(n_envs, dtype=bool)
+    success, reached, returns = [], [], []
     env_steps = n_diverged = 0
 
     obs = venv.reset()
@@ -77,6 +79,7 @@ def run_episodes(
         new_obs, rewards, dones, infos = venv.step(actions)
         env_steps += n_envs
         returns_so_far += one_each(rewards, n_envs, "the environment's step")
+        reached_so_far |= [_is_on_goal(info) for info in infos]
         if on_step is not None:
             next_obs = with_terminal_observations(new_obs, dones, infos)  # type: ignore[arg-type]
             on_step(obs, actions, rewards, dones, infos, next_obs)  # type: ignore[arg-type]
@@ -95,12 +98,19 @@ def run_episodes(
                         "success rates need an environment that reports it"
                     )
                 success.append(bool(one_number(infos[i]["is_success"], "is_success in the info")))
+                reached.append(reached_so_far[i])
                 returns.append(returns_so_far[i])
                 finished[i] += 1
-            returns_so_far[i] = 0.0
+            returns_so_far[i], reached_so_far[i] = 0.0, False
         obs = new_obs
 
-    return Episodes(np.array(success), np.array(returns), env_steps)
+    return Episodes(np.array(success), np.array(reached), np.array(returns), env_steps)
+
+
+def _is_on_goal(info: dict[str, Any]) -> bool:
+    """Whether a step says that its goal is reached; only an episode's last one has to say."""
+    said = info.get("is_success", False)
+    return isinstance(said, bool | int | float | np.generic) and said == 1
 
 
 def noise_free(model: BaseAlgorithm, learning: bool = False) -> Policy:

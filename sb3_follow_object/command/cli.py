@@ -194,22 +194,25 @@ def _evaluate(args: argparse.Namespace) -> None:
     env_id = args.env or config.env_id
     seed = config.seed if args.seed is None else args.seed
     if env_id in (config.env_id, config.full_id):
-        rate = evaluate(args.run / POLICY, env_id, args.episodes, seed).success_rate
+        episodes = evaluate(args.run / POLICY, env_id, args.episodes, seed)
+        rate, reached = episodes.success_rate, {"reached_rate": float(episodes.reached.mean())}
     else:
-        rate = cross_test(args.run, env_id, args.episodes, seed, _warn)
+        rate, reached = cross_test(args.run, env_id, args.episodes, seed, _warn), {}
     result = {
         "env": env_id,
         "method": config.method,
         "seed": config.seed,
         "episodes": args.episodes,
         "success_rate": rate,
+        **reached,
         "env_steps": trained_steps(args.run),
     }
     if args.json:
         print(json.dumps(result))
     else:
         row = {name: result[name] for name in ("env", "method", "seed")}
-        _print_table(row | _outcome(result))
+        row |= _outcome(result)
+        _print_table(row | ({"reached": f"{reached['reached_rate']:.3f}"} if reached else {}))
 
 
 def _outcome(result: dict[str, Any]) -> dict[str, str]:

@@ -302,6 +302,22 @@ def test_episodes_take_nothing_that_does_not_fit(
         run_episodes(policy or (lambda obs: zeros), DummyVecEnv([Odd] * N), N)
 
 
+def test_episodes_that_leave_their_goal_have_reached_it() -> None:
+    class Passing(toy.PointEnv):
+        def step(self, action: np.ndarray) -> Any:
+            *rest, truncated, info = super().step(action)
+            first = self.steps == 1
+            return *rest, truncated, {**info, "is_success": first and self.passes}
+
+        def reset(self, **options: Any) -> Any:
+            self.passes = not getattr(self, "passes", False)  # every other episode
+            return super().reset(**options)
+
+    episodes = run_episodes(lambda obs: np.zeros((1, 3), np.float32), DummyVecEnv([Passing]), 4)
+    assert episodes.success.tolist() == [False] * 4
+    assert episodes.reached.tolist() == [True, False, True, False]
+
+
 def test_rewards_of_a_vectorised_environment_are_not_broadcast() -> None:
     class Scalar(DummyVecEnv):
         def step_wait(self) -> Any:

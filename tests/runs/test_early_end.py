@@ -24,7 +24,7 @@ def validations(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     def run_episodes(*arguments: Any) -> Episodes:
         rate = rates.pop(0)
-        return Episodes(np.arange(10) < 10 * rate, np.zeros(10), 0)
+        return Episodes(*[np.arange(10) < 10 * rate] * 2, np.zeros(10), 0)
 
     monkeypatch.setattr(eval_callback, "run_episodes", run_episodes)
     return rates
