@@ -18,12 +18,12 @@ from sb3_follow_object.comparison import figures, ray_executor
 from sb3_follow_object.comparison.ray_executor import RayExecutor, _write_files
 from sb3_follow_object.comparison.worker import TRAIN, Job
 
-TINY = ["policy_kwargs.net_arch=[8]", "batch_size=16", "gradient_steps=2", "n_envs=2"]
-TINY += ["object_timesteps=800", "n_paths=8", "predictor_fit.epochs=1", "predictor_fit.hidden=[8]"]
+SMALL = ["policy_kwargs.net_arch=[8]", "batch_size=16", "gradient_steps=2", "n_envs=2"]
+SMALL += ["eval_every=1000", "n_eval_episodes=2", "n_final_episodes=2", "buffer_size=2000"]
+TINY = ["object_timesteps=800", "n_paths=8", "predictor_fit.epochs=1", "predictor_fit.hidden=[8]"]
 TINY += ["object_algorithm.policy_kwargs.net_arch=[8]", "object_algorithm.batch_size=16"]
 TINY += ["object_algorithm.gradient_steps=2", "object_algorithm.buffer_size=2000"]
-TINY += ["n_test_episodes=2", "eval_every=1000"]
-TINY += ["n_eval_episodes=2", "n_final_episodes=2", "buffer_size=2000"]
+TINY += ["n_test_episodes=2", *SMALL]
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_run_that_raises_on_a_node_is_tried_twice_and_reported(
     cluster: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["compare", "--out", str(tmp_path), "--tasks", "PushSideGap", "--methods", "cher"]
-    words += ["--steps", "600", "--ray", cluster.address, "--set", *TINY, "replay_on_device=true"]
+    words += ["--steps", "600", "--ray", cluster.address, "--set", *SMALL, "replay_on_device=true"]
     assert main(words) == 2
     printed = capsys.readouterr()
     assert "1 of 1 runs failed: PushSideGap-cher-0" in printed.err

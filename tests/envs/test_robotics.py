@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from sb3_follow_object import FollowObject
+from sb3_follow_object.any_task import derived as derived_tasks
 from sb3_follow_object.any_task.derived import derived
 from sb3_follow_object.envs import make_vec, robotics
 from sb3_follow_object.envs.goal_envs import check_task
@@ -30,6 +31,7 @@ def test_its_environments_are_refused_from_mujoco_3_12_on(
 ) -> None:
     installed(monkeypatch, mujoco="4.0.0", robotics="1.4.2")
     monkeypatch.setenv("SB3_FOLLOW_OBJECT_CACHE", str(tmp_path))
+    monkeypatch.setattr(derived_tasks, "_LOOKED_AT", {})  # as in a new process
     with pytest.raises(ValueError) as error:
         ask("FetchPush-v4")
     assert str(error.value) == (
