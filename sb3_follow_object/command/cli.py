@@ -211,8 +211,9 @@ def _evaluate(args: argparse.Namespace) -> None:
         print(json.dumps(result))
     else:
         row = {name: result[name] for name in ("env", "method", "seed")}
-        row |= _outcome(result)
-        _print_table(row | ({"reached": f"{reached['reached_rate']:.3f}"} if reached else {}))
+        _print_table(row | _outcome(result))
+        for share in reached.values():
+            print(f"reached at any step: {share:.3f} of {args.episodes}")
 
 
 def _outcome(result: dict[str, Any]) -> dict[str, str]:

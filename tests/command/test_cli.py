@@ -101,8 +101,10 @@ def test_evaluation_repeats_the_final_test(
         "seed": 3,
         "episodes": 8,
         "success_rate": result["success_rate"],
+        "reached_rate": json.loads(out)["reached_rate"],
         "env_steps": result["env_steps"],
     }
+    assert json.loads(out)["reached_rate"] >= result["success_rate"]
 
 
 def test_evaluation_is_a_table_of_a_line_in_eighty_columns(
@@ -116,6 +118,7 @@ def test_evaluation_is_a_table_of_a_line_in_eighty_columns(
     cells = [cell.strip() for cell in row.strip("│").split("│")]
     assert cells[:4] == [TASK, "fo", "3", f"{steps:,}"]
     assert cells[4].endswith(" of 4")
+    assert out.splitlines()[-1].startswith("reached at any step: ")
 
 
 def test_policy_and_config_alone_can_be_evaluated(
