@@ -195,16 +195,16 @@ def _evaluate(args: argparse.Namespace) -> None:
     seed = config.seed if args.seed is None else args.seed
     if env_id in (config.env_id, config.full_id):
         episodes = evaluate(args.run / POLICY, env_id, args.episodes, seed)
-        rate, reached = episodes.success_rate, {"reached_rate": float(episodes.reached.mean())}
+        rate, reached = episodes.success_rate, float(episodes.reached.mean())
     else:
-        rate, reached = cross_test(args.run, env_id, args.episodes, seed, _warn), {}
+        rate, reached = cross_test(args.run, env_id, args.episodes, seed, _warn), None
     result = {
         "env": env_id,
         "method": config.method,
         "seed": config.seed,
         "episodes": args.episodes,
         "success_rate": rate,
-        **reached,
+        **({} if reached is None else {"reached_rate": reached}),
         "env_steps": trained_steps(args.run),
     }
     if args.json:
@@ -212,8 +212,8 @@ def _evaluate(args: argparse.Namespace) -> None:
     else:
         row = {name: result[name] for name in ("env", "method", "seed")}
         _print_table(row | _outcome(result))
-        for share in reached.values():
-            print(f"reached at any step: {share:.3f} of {args.episodes}")
+        if reached is not None:
+            print(f"reached at any step: {reached:.3f} of {args.episodes}")
 
 
 def _outcome(result: dict[str, Any]) -> dict[str, str]:

@@ -58,26 +58,23 @@ def plan(
         if method not in METHODS:
             raise ValueError(f"there is no method {method!r}{did_you_mean(method, METHODS)}")
     ids = {task_name(env_id): env_id for env_id in map(_env_id, tasks)}
+    read = {(e, m): _read_by(e, m, settings) for e in ids.values() for m in methods}
     for name in settings.overrides or {}:
-        if not any(
-            name in (_read_by(env_id, method, settings).overrides or {})
-            for env_id in ids.values()
-            for method in methods
-        ):
+        if not any(name in (its.overrides or {}) for its in read.values()):
             raise ValueError(f"--set {name} does nothing: none of {', '.join(methods)} reads it")
     check_settings(folder, settings)
     cells = []
     for seed in dict.fromkeys(seeds):
         for task, env_id in ids.items():
             for method in dict.fromkeys(methods):
-                read = _read_by(env_id, method, settings)
-                config = _config(env_id, method, seed, read, threads)
+                own = read[env_id, method]
+                config = _config(env_id, method, seed, own, threads)
                 path = folder / f"{file_name(task)}-{method}-{seed}"
-                command = _command(path, config, read)
+                command = _command(path, config, own)
                 cell = Cell(path, task, config, command)
                 kept = _kept_config(cell)
                 if kept is not None:
-                    cell = replace(cell, config=kept, command=_command(path, kept, read))
+                    cell = replace(cell, config=kept, command=_command(path, kept, own))
                 cells.append(cell)
     return cells
 

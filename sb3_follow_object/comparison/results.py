@@ -9,7 +9,6 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -155,7 +154,7 @@ def _told_apart(runs: Iterable[Run]) -> list[Run]:
         begun = [run for run in group if (run.folder / CONFIG).exists()]
         words = words_apart([flat(load_config(run.folder).settings) for run in begun])
         pairs = zip(begun, words, strict=True)
-        names = {run.folder: f"{method} ({shorten(differ, 60)})" for run, differ in pairs if differ}
+        names = {run.folder: f"{method} ({differ})" for run, differ in pairs if differ}
         told += [replace(run, method=names.get(run.folder, method)) for run in group]
     return told
 
