@@ -28,6 +28,15 @@ pytestmark = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a CUDA
 
 CUDA = "cuda"
 
+MIRROR = {"axis": 0, "at": 0.0, "positions": [0], "actions": [0]}
+DEFAULT: dict[str, Any] = {  # of the default preset, what the steps and the draws depend on
+    "policy_delay": 2,
+    "hindsight_bound": True,
+    "average_decay": 0.9996,
+    "tau": 0.01,
+    "policy_kwargs": {"net_arch": [32, 32], "critic_layer_norm": True, "mirrors": [MIRROR]},
+}
+
 
 def trained(steps: int = 400, **kwargs: Any) -> HerDDPG:
     model = make_model(device=CUDA, **kwargs)
@@ -56,6 +65,7 @@ def without_graphs(model: HerDDPG) -> HerDDPG:
             "target_update_interval": 4,
             "policy_kwargs": {"net_arch": [64], "critic_layer_norm": True},
         },
+        DEFAULT,
     ],
 )
 def test_graphs_take_the_same_steps_to_the_last_bit(kwargs: dict[str, Any]) -> None:
@@ -75,16 +85,36 @@ def test_one_graph_serves_all_where_targets_move_seldom(gradient_steps: int) -> 
     assert len(model._updates._graphs) == 1
 
 
-def test_same_seed_same_weights() -> None:
-    first, again = (trained(2000) for _ in range(2))
+@pytest.mark.parametrize("kwargs", [{}, DEFAULT])
+def test_same_seed_same_weights(kwargs: dict[str, Any]) -> None:
+    first, again = (trained(2000, **kwargs) for _ in range(2))
     assert first._updates._graphs
     assert th.equal(weights(first), weights(again))
-    assert not th.equal(weights(first), weights(trained(2000, seed=1)))
+    assert not th.equal(weights(first), weights(trained(2000, seed=1, **kwargs)))
 
 
-def test_resumed_training_equals_uninterrupted() -> None:
-    for model in assert_resumes_exactly(6, device=CUDA):
+@pytest.mark.parametrize("kwargs", [{}, DEFAULT])
+def test_resumed_training_equals_uninterrupted(kwargs: dict[str, Any]) -> None:
+    for model in assert_resumes_exactly(6, device=CUDA, **kwargs):
         assert model._updates._graphs
+
+
+@pytest.mark.parametrize("kwargs", [{}, DEFAULT])
+def test_training_goes_on_on_the_other_device(kwargs: dict[str, Any]) -> None:
+    there, here = trained(1200, **kwargs), make_model(device="cpu", seed=1, **kwargs)
+    assert there._updates._graphs
+    for model, other in ((there, here), (here, make_model(device=CUDA, seed=2, **kwargs))):
+        other.set_logger(there.logger)
+        other.load_training_state(copy.deepcopy(model.training_state()))
+        other.replay_buffer.load_state_dict(  # type: ignore[union-attr]
+            copy.deepcopy(model.replay_buffer.state_dict())  # type: ignore[union-attr]
+        )
+        assert th.equal(weights(other).cpu(), weights(model).cpu())
+        before = weights(other).clone()
+        for _ in range(6):
+            other.train(5, 64)
+        assert weights(other).isfinite().all() and not th.equal(weights(other), before)
+    assert other._updates._graphs
 
 
 def test_a_learning_rate_that_changes_reaches_the_graph() -> None:
@@ -172,8 +202,9 @@ def test_a_run_imagines_where_it_learns() -> None:
     run.close()
 
 
-def test_an_actor_saved_there_plays_on_the_cpu(tmp_path: Path) -> None:
-    model = trained()
+@pytest.mark.parametrize("kwargs", [{}, DEFAULT])
+def test_an_actor_saved_there_plays_on_the_cpu(tmp_path: Path, kwargs: dict[str, Any]) -> None:
+    model = trained(**kwargs)
     save_actor(tmp_path / "policy.safetensors", model.policy.actor_average, "Point-v0")
     assert model.env is not None
     spaces = model.observation_space, model.action_space
