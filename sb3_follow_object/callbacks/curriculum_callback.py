@@ -7,7 +7,12 @@ from typing import Any, cast
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecNormalize,
+    is_vecenv_wrapped,
+    unwrap_vec_wrapper,
+)
 
 from ..ddpg.whole_episodes import WholeEpisodesDDPG
 from ..imagination.curriculum import Curriculum
@@ -34,7 +39,8 @@ class CurriculumCallback(CopyableCallback):
 
     Args:
         test_env: ImaginedGoalVecEnv with mode="test", or wrappers around one, sharing the
-            training's curriculum; None makes as many copies of the training's environment, with all
+            training's curriculum, and not in VecNormalize: a model that was trained in one
+            normalises by itself; None makes as many copies of the training's environment, with all
             that it is wrapped in, when training starts.
         n_episodes: episodes of a test, >= 1; None, one of every copy.
         every: cycles between tests, >= 1.
@@ -47,8 +53,8 @@ class CurriculumCallback(CopyableCallback):
             the model's num_timesteps.
 
     Raises:
-        ValueError: an argument is outside its range, test_env does not show h_max, or training
-            starts in an environment that imagines no goals, with a test_env of another curriculum,
+        ValueError: an argument is outside its range, test_env does not show h_max or is in
+            VecNormalize, or training starts in an environment that imagines no goals, with a test_env of another curriculum,
             or without one where none can be copied.
     """
 
@@ -65,6 +71,10 @@ class CurriculumCallback(CopyableCallback):
             imagined = unwrap_vec_wrapper(test_env, ImaginedGoalVecEnv)
             if imagined is None or imagined.mode != "test":
                 raise ValueError("test_env must be an ImaginedGoalVecEnv with mode='test'.")
+            if is_vecenv_wrapped(test_env, VecNormalize):
+                raise ValueError(
+                    "test_env is in VecNormalize; the model's own normalises already: leave it out."
+                )
         settings = CurriculumTestSettings(n_episodes=n_episodes, every=every, store=store)
         self._test_env = test_env
         self._copied: VecEnv | None = None  # the training's, where the test's is a copy of it
@@ -109,6 +119,8 @@ class CurriculumCallback(CopyableCallback):
         # Who knows what step the environment stands at after an exception? Ours do.
         if broken_off and not isinstance(self.model, WholeEpisodesDDPG):
             self._begin_new_episodes()
+        if self.model.num_timesteps == 0:  # the environment was reset, wherever it stood
+            end_running_episodes(getattr(self.model, "replay_buffer", None))
         self._is_training = True
         another = self._trained is not self.model
         if self._trained is not None and self.model.num_timesteps == 0:
@@ -152,6 +164,7 @@ class CurriculumCallback(CopyableCallback):
 
     def _begin_new_episodes(self) -> None:
         model: Any = self.model
+        end_running_episodes(getattr(model, "replay_buffer", None))
         model._last_obs = self.training_env.reset()
         model._last_episode_starts = np.ones(self.training_env.num_envs, dtype=bool)
         normaliser = model.get_vec_normalize_env()
@@ -164,6 +177,7 @@ class CurriculumCallback(CopyableCallback):
         model, self._is_training = cast(Any, self.model), False
         if model._last_obs is not self.locals.get("new_obs", model._last_obs):
             model._last_obs = None
+            end_running_episodes(getattr(model, "replay_buffer", None))
 
     def _on_step(self) -> bool:
         self._episode_ended |= bool(np.any(self.locals["dones"]))

@@ -268,5 +268,5 @@ def _play(env: gym.Env, steps: int = 10) -> None:
 def _cannot(what: str, reason: str) -> ValueError:
     return ValueError(
         f"CurriculumCallback cannot copy {what} of the training's environment ({reason}): give it "
-        "a test_env with the same wrappers and settings."
+        "a test_env with the same wrappers and settings, without VecNormalize."
     )

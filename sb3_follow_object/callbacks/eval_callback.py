@@ -150,8 +150,8 @@ class OriginalGoalEvalCallback(CopyableCallback):
 
     def _on_training_start(self) -> None:
         self._wall_before, self._started = self.wall_s, time.monotonic()
-        if self.n_evaluations and not self._resumed and self.model.num_timesteps == 0:
-            self._last_steps = 0  # counted anew, as SB3 does its steps unless told otherwise
+        if not self._resumed and self.model.num_timesteps < self._last_steps:
+            self._last_steps = 0  # of another model, or SB3 counts its steps anew
         if self.csv_path is not None:
             self._rows = self._earlier_rows(self.csv_path)
             self._write_csv(self.csv_path)

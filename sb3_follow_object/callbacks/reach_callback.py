@@ -85,12 +85,18 @@ class ReachCallback(CopyableCallback):
                 f"{self.policy.tolerance} m, and the environment has {list(told.effector)} within "
                 f"{told.tolerance} m; give a new one"
             )
+        shapes = self.model.observation_space["observation"].shape, self.model.action_space.shape  # type: ignore[index]
+        if shapes != self.policy.shapes:
+            raise ValueError(
+                f"this ReachCallback was taught with observations and actions of the shapes "
+                f"{self.policy.shapes}, and the environment's are {shapes}; give a new one"
+            )
         if self.policy.has_learned:
             self._carry(self.policy)
 
     def _on_training_end(self) -> None:
-        assert self.policy is not None
-        if self.policy.has_learned:  # whoever plays there now shall see what the learner can do
+        # rl_zoo3 calls this also where the training was refused.
+        if self.policy is not None and self.policy.has_learned:  # whoever plays there now shall see what the learner can do
             self._ask("set_reach", self.policy.actor(), 0.0)
 
     def _on_step(self) -> bool:
@@ -145,7 +151,7 @@ class ReachCallback(CopyableCallback):
         return self.training_env.env_method(method, *arguments)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a resumed training needs."""
+        """Return what a resumed training needs, as tensors that training changes."""
         return {
             "policy": None if self.policy is None else self.policy.state_dict(),
             "success": float(self.success),

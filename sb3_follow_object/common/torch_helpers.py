@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -40,6 +41,11 @@ def threads_at(n: int | None) -> Iterator[None]:
 def own(tensor: th.Tensor) -> th.Tensor:
     """Return a tensor that no other process writes to: itself, or a copy of a shared one."""
     return tensor.clone() if tensor.is_shared() else tensor
+
+
+def load_optimizer(optimizer: th.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Load `state_dict` of an optimiser, which may go on: PyTorch would share its tensors."""
+    optimizer.load_state_dict(copy.deepcopy(state))
 
 
 class WholeModule(WholeCopies, nn.Module):

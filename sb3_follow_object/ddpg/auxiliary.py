@@ -13,7 +13,7 @@ from torch import nn
 
 from ..common.answers import check_shape
 from ..common.providers import provider
-from ..common.torch_helpers import WholeModule, lowest, matmul_at
+from ..common.torch_helpers import WholeModule, load_optimizer, lowest, matmul_at
 from ..settings.fields import check_names
 from ..settings.learning import AUXILIARY as KIND
 from ..settings.learning import AuxiliarySettings, check_auxiliary
@@ -201,7 +201,7 @@ class AuxiliaryCritic(WholeModule):
         """Continue from `training_state`."""
         self.load_state_dict(state["networks"])
         for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(state["optimizers"][name])
+            load_optimizer(optimizer, state["optimizers"][name])
 
 
 def reward_class(settings: Mapping[str, Any]) -> type[AuxiliaryReward]:

@@ -10,6 +10,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from ..common.copies import WholeCopies
+from ..common.torch_helpers import load_optimizer
 from ..replay.device_replay import DeviceReplay
 from .auxiliary import AuxiliaryCritic
 from .input_moments import InputMoments
@@ -59,7 +60,8 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
     def training_state(self) -> dict[str, Any]:
         """Return everything that the next rollout and update depend on, between rollouts.
 
-        The environment has its own state, and so has the replay buffer.
+        The environment has its own state, and so has the replay buffer. Tensors are those that
+        training changes: to come back to a state later, keep a `copy.deepcopy` of it.
         """
         return {
             "policy": self.policy.state_dict(),
@@ -90,8 +92,8 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
                 f"the policy was trained with the mirrors {state['mirrors']}, not {mirrors}"
             )
         self.policy.load_state_dict(state["policy"])
-        self.actor.optimizer.load_state_dict(state["actor_optimizer"])
-        self.critic.optimizer.load_state_dict(state["critic_optimizer"])
+        load_optimizer(self.actor.optimizer, state["actor_optimizer"])
+        load_optimizer(self.critic.optimizer, state["critic_optimizer"])
         for optimizer in (self.actor.optimizer, self.critic.optimizer):
             for group in optimizer.param_groups:
                 group["capturable"] = False  # of graphs on CUDA, which set it themselves

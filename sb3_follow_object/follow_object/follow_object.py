@@ -331,7 +331,10 @@ class FollowObject:
     # ---- saving -------------------------------------------------------------------------------
 
     def state_dict(self, replay_buffer: bool = True) -> dict[str, Any]:
-        """Return what `learn` has changed, at an episode's end of every copy."""
+        """Return what `learn` has changed, at an episode's end of every copy.
+
+        It holds the tensors that training changes: keep a `copy.deepcopy` to come back to it.
+        """
         return {
             "object_steps": self.object_steps,
             "object_success": self.object_stage.success,

@@ -139,7 +139,14 @@ class Approach:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
+        """Continue from `state_dict` of as many copies.
+
+        Raises:
+            ValueError: it is of others.
+        """
+        n, ours = len(state["reaching"]), len(self.reaching)
+        if n != ours:
+            raise ValueError(f"the saved reaching is of {n} environments, and there are {ours}")
         self.rng.bit_generator.state = state["rng"]
         self.share = float(state["share"])
         for name in self._ARRAYS:

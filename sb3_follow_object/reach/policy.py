@@ -16,7 +16,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from torch import nn
 
 from ..common.copies import WholeCopies
-from ..common.torch_helpers import usual_defaults
+from ..common.torch_helpers import load_optimizer, usual_defaults
 from ..ddpg.auxiliary import AuxiliaryCritic, Transitions
 from ..ddpg.input_moments import MIN_STD
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
@@ -70,6 +70,7 @@ class ReachPolicy(WholeCopies):
         self.rng = np.random.default_rng(seed)
         observation = observation_space["observation"]
         check_effector(self.effector, observation)
+        self.shapes = observation.shape, action_space.shape
         place = spaces.Box(-np.inf, np.inf, (len(self.effector),), np.float32)
         inputs = spaces.Dict(
             {"observation": observation, "achieved_goal": place, "desired_goal": place}
@@ -161,7 +162,7 @@ class ReachPolicy(WholeCopies):
         return self.policy.live_and_targets()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next updates depend on."""
+        """Return everything that the next updates depend on, as tensors that they change."""
         return {
             "policy": self.policy.state_dict(),
             "actor_optimizer": self.policy.actor.optimizer.state_dict(),
@@ -177,8 +178,8 @@ class ReachPolicy(WholeCopies):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
         self.policy.load_state_dict(state["policy"])
-        self.policy.actor.optimizer.load_state_dict(state["actor_optimizer"])
-        self.policy.critic.optimizer.load_state_dict(state["critic_optimizer"])
+        load_optimizer(self.policy.actor.optimizer, state["actor_optimizer"])
+        load_optimizer(self.policy.critic.optimizer, state["critic_optimizer"])
         self.moments.mean, self.moments.var = state["mean"].copy(), state["var"].copy()
         self.moments.count = state["count"]
         self.idle = state["idle"].astype(bool)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any
@@ -146,6 +147,39 @@ def test_test_episodes_of_unequal_length_do_not_run_into_the_training() -> None:
         assert (goals[1:] == goals[:-1]).all(axis=1)[same_episode].all()
 
 
+class Breaks(BaseCallback):
+    """Stop or break off the training in the middle of episodes."""
+
+    def __init__(self, raises: bool) -> None:
+        super().__init__()
+        self.raises = raises
+
+    def _on_step(self) -> bool:
+        done = self.n_calls < toy.HORIZON + toy.HORIZON // 2
+        if self.raises and not done:
+            raise InterruptedError
+        return done
+
+
+@pytest.mark.parametrize("anew", [False, True])
+@pytest.mark.parametrize("raises", [False, True])
+def test_episodes_that_training_broke_off_are_not_gone_on_with(raises: bool, anew: bool) -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    model = learner(imagining(curriculum), train_freq=(1, "step"))
+    callback = CurriculumCallback(imagining(curriculum, "test"), N, every=10**6)
+    with contextlib.suppress(InterruptedError):
+        model.learn(10**4, callback=[callback, Breaks(raises)])
+    model.learn(3 * N * toy.HORIZON, callback=callback, reset_num_timesteps=anew)
+    buffer = model.replay_buffer
+    filled = slice(0, buffer.pos)
+    starts, ended = buffer.ep_start[filled], buffer.ep_length[filled] > 0
+    within = (starts[1:] == starts[:-1]) & ended[1:] & ended[:-1]
+    came = buffer.next_observations["achieved_goal"][filled][:-1]
+    went_on = buffer.observations["achieved_goal"][filled][1:]
+    assert within.sum() > 3 * N * toy.HORIZON // 2
+    np.testing.assert_array_equal(came[within], went_on[within])
+
+
 @pytest.mark.parametrize("algorithm", [DDPG, TD3, SAC])
 def test_stock_algorithms_climb_the_curriculum(algorithm: Any) -> None:
     class StopAtLevel(BaseCallback):
@@ -223,6 +257,12 @@ def test_a_test_env_must_show_h_max() -> None:
     for env in (imagining(toy.curriculum()), bare()):
         with pytest.raises(ValueError, match="mode='test'"):
             CurriculumCallback(env, 1)  # type: ignore[arg-type]
+
+
+def test_a_test_env_in_vec_normalize_is_refused() -> None:
+    normalised: Any = VecNormalize(imagining(toy.curriculum(), "test"))
+    with pytest.raises(ValueError, match="test_env is in VecNormalize"):
+        CurriculumCallback(normalised, 1)
 
 
 def test_a_test_env_must_share_the_curriculum() -> None:

@@ -113,6 +113,16 @@ def test_learning_anew_after_a_resumption_counts_anew() -> None:
     assert evaluation.n_evaluations - before == 160 // 40
 
 
+def test_a_model_that_has_trained_less_is_evaluated_too() -> None:
+    evaluation = OriginalGoalEvalCallback(bare(), N, 40)
+    learner(bare()).learn(400, callback=evaluation)
+    before = evaluation.n_evaluations
+    model = learner(bare())
+    model.learn(40)
+    model.learn(160, callback=evaluation, reset_num_timesteps=False)
+    assert evaluation.n_evaluations - before == 160 // 40
+
+
 def test_only_training_counts_as_training_time(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(eval_callback.time, "monotonic", lambda: now[0])

@@ -10,7 +10,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import toy
-from gymnasium.wrappers import RescaleAction
+from gymnasium import spaces
+from gymnasium.wrappers import RescaleAction, TransformObservation
 from reaching import HORIZON, REACH, STEP, TASK, StraightActor, learner
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -198,6 +199,66 @@ def test_a_callback_is_not_taught_with_another_effector() -> None:
     other = ReachFirstVecEnv(DummyVecEnv([lambda: gym.make(TASK)] * N), effector=(3, 4, 5))
     with pytest.raises(ValueError, match=r"was taught with the effector \[0, 1, 2\] .* give a new"):
         learner(other).learn(N * HORIZON, callback)
+
+
+def test_a_callback_is_not_taught_with_other_observations() -> None:
+    callback = ReachCallback(**TINY)
+    learner(FACES["VecEnv"]()).learn(N * HORIZON, callback)
+
+    def seen_longer() -> gym.Env:
+        env = gym.make(TASK)
+        inner = env.observation_space
+        assert isinstance(inner, spaces.Dict)
+        longer = spaces.Box(-np.inf, np.inf, (inner["observation"].shape[0] + 2,), np.float64)  # type: ignore[index]
+        return TransformObservation(
+            env,
+            lambda obs: {**obs, "observation": np.append(obs["observation"], [0.0, 0.0])},
+            spaces.Dict({**inner.spaces, "observation": longer}),
+        )
+
+    other = ReachFirstVecEnv(DummyVecEnv([seen_longer] * N), **REACH)
+    with pytest.raises(ValueError, match="observations and actions of the shapes .* give a new"):
+        learner(other).learn(N * HORIZON, callback)
+
+
+def test_a_refused_training_may_be_ended() -> None:
+    callback = ReachCallback()
+    with pytest.raises(ValueError, match="nothing reaches first"):
+        learner(DummyVecEnv([lambda: gym.make(TASK)])).learn(HORIZON, callback)
+    callback.on_training_end()  # as rl_zoo3 does
+
+
+def test_a_training_that_was_broken_off_may_be_ended(straight: None) -> None:
+    env = FACES["VecEnv"]()
+    model, callback = learner(env), ReachCallback(share=1.0, fade=False, **TINY)
+
+    class Breaks(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.n_calls == 3 * HORIZON:
+                raise InterruptedError
+            return True
+
+    with pytest.raises(InterruptedError):
+        model.learn(10**6, [callback, Breaks()])
+    assert effectors_move(env)
+    callback.on_training_end()
+    assert not effectors_move(env)
+
+
+def test_two_callbacks_of_one_state_do_not_share_it() -> None:
+    model, callback = learner(FACES["VecEnv"]()), ReachCallback(**TINY)
+    model.learn(4 * N * HORIZON, callback)
+    assert callback.policy is not None
+
+    def moments() -> list[np.ndarray]:
+        states = callback.policy.policy.critic.optimizer.state.values()  # type: ignore[union-attr]
+        return [state["exp_avg"].numpy().copy() for state in states]
+
+    before, other = moments(), ReachCallback(**TINY)
+    other.load_state_dict(callback.state_dict(), model)
+    learner(FACES["VecEnv"]()).learn(2 * N * HORIZON, other)
+    for then, now in zip(before, moments(), strict=True):
+        np.testing.assert_array_equal(then, now)
 
 
 def reports(callback: ReachCallback, *rollouts: tuple[int, int, int, int]) -> list[float]:
