@@ -17,6 +17,8 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 
+NUMBER = 8  # bytes before each question that hold its number; its answer has the same
+
 
 class Copies:
     """Copies of one environment, stepped one after the other; episodes begin anew by themselves.
@@ -98,7 +100,7 @@ def serve(pipe: Connection) -> None:
     """Answer what the other end asks until it is gone."""
     path, maker, n = pipe.recv()
     sys.path[:] = path
-    copies = None
+    copies, number = None, 0
     try:
         while True:
             try:
@@ -106,14 +108,16 @@ def serve(pipe: Connection) -> None:
                     copies = Copies(cloudpickle.loads(maker), n)
                     answer: Any = None
                 else:
-                    name, arguments = cloudpickle.loads(pipe.recv_bytes())
+                    question = pipe.recv_bytes()
+                    number = int.from_bytes(question[:NUMBER], "big")
+                    name, arguments = cloudpickle.loads(question[NUMBER:])
                     answer = getattr(copies, name)(*arguments)
-                pipe.send((None, answer))
+                pipe.send((number, None, answer))
             except (EOFError, ConnectionError, KeyboardInterrupt):
                 break
             except Exception as error:  # an environment of somebody's may raise anything
                 with suppress(OSError):
-                    pipe.send(((_told(error), format_exc()), None))
+                    pipe.send((number, (_told(error), format_exc()), None))
                 if copies is None:
                     break
     finally:

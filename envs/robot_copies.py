@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -21,6 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from ..common.numbers import checked_whole
 from .batch import cores
+from .copies_worker import NUMBER
 from .copies_worker import __name__ as WORKER
 from .make import make_vec
 from .registration import import_robotics, import_task, registration_key
@@ -176,9 +178,16 @@ class ProcessVecEnv(VecEnv):
         return self._joined([obs for obs, _ in answers])
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Send the actions (n_envs, ...) to the processes."""
+        """Send the actions (n_envs, ...) to the processes.
+
+        Raises:
+            ValueError: there are more or fewer actions.
+        """
+        actions = np.asarray(actions)
+        if len(actions) != self.num_envs:
+            raise ValueError(f"{len(actions)} actions were given for {self.num_envs} environments")
         for worker, rows in zip(self._workers, self._rows, strict=True):
-            worker.ask_step(np.asarray(actions)[rows])
+            worker.ask_step(actions[rows])
 
     def step_wait(
         self,
@@ -276,7 +285,12 @@ class ProcessVecEnv(VecEnv):
 
 
 class _Worker:
-    """A process with some copies, and this process's end of the line to it."""
+    """A process with some copies, and this process's end of the line to it.
+
+    Questions are numbered, so that answers that nobody waited for, as an exception came between,
+    are not taken for those to what is asked next. Signals to this process's group do not reach it:
+    it ends when the line does.
+    """
 
     def __init__(self, make: Callable[[], gym.Env], n: int) -> None:
         ours, theirs = socketpair()
@@ -284,31 +298,47 @@ class _Worker:
             [sys.executable, "-m", WORKER, str(theirs.fileno())],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
+            start_new_session=True,
         )
         theirs.close()
         self._pipe = Connection(ours.detach())
+        self._asked = 0
         self._pipe.send((sys.path, cloudpickle.dumps(make), n))
 
     def ask(self, name: str, *arguments: Any) -> None:
-        self._pipe.send_bytes(cloudpickle.dumps((name, arguments)))
+        self._send(cloudpickle.dumps((name, arguments)))
 
     def ask_step(self, actions: np.ndarray) -> None:
         """Ask for a step; numbers need no cloudpickle, which takes three times as long."""
-        self._pipe.send(("step", (actions,)))
+        self._send(pickle.dumps(("step", (actions,))))
+
+    def _send(self, question: bytes) -> None:
+        if self._pipe.closed:
+            raise RuntimeError("the robot's environment is closed")
+        self._asked += 1
+        try:
+            self._pipe.send_bytes(self._asked.to_bytes(NUMBER, "big") + question)
+        except OSError as ended:
+            raise self._has_ended() from ended
 
     def answer(self) -> Any:
-        """Wait for what was asked; raise what went wrong there."""
-        try:
-            error, answer = self._pipe.recv()
-        except (EOFError, ConnectionError) as ended:
-            code = self._process.wait()
-            raise RuntimeError(
-                f"a process of the robot's environment has ended by itself (status {code})"
-            ) from ended
+        """Wait for what was asked last; raise what went wrong there."""
+        number = -1
+        while number < self._asked:
+            try:
+                number, error, answer = self._pipe.recv()
+            except (EOFError, OSError) as ended:
+                raise self._has_ended() from ended
         if error is not None:
             raised, traceback = error
             raise raised from RuntimeError(f"in a process of the robot's environment\n{traceback}")
         return answer
+
+    def _has_ended(self) -> RuntimeError:
+        return RuntimeError(
+            "a process of the robot's environment has ended by itself (status "
+            f"{self._process.wait()})"
+        )
 
     def close(self) -> None:
         self._pipe.close()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -137,6 +140,92 @@ def test_what_goes_wrong_in_a_process_is_raised_here(
         pickle.dumps(env)
     env.close()
     env.close()
+
+
+class Counts(toy.PointEnv):
+    """Its object tells the steps of its episode."""
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        return {**super()._observe(), "achieved_goal": np.full(3, float(self.steps))}
+
+    def unreadable(self, what: Any) -> None:
+        pass
+
+
+class Unreadable:
+    def __reduce__(self) -> Any:
+        return _not_here, ()
+
+
+def _not_here() -> None:
+    raise LookupError("not in this process")
+
+
+def _steps(obs: Any) -> list[float]:
+    return obs["achieved_goal"][:, 0].tolist()
+
+
+def test_answers_that_nobody_waited_for_are_not_taken_for_others() -> None:
+    env = ProcessVecEnv(Counts, 4, 2)
+    still = np.zeros((4, 3), np.float32)
+    assert _steps(env.reset()) == [0.0] * 4
+    env.step_async(still)  # and then an exception, such as Ctrl-C, comes between
+    assert _steps(env.step(still)[0]) == [2.0] * 4
+    env.step_async(still)
+    assert _steps(env.reset()) == [0.0] * 4
+    with pytest.raises(ValueError, match="3 actions were given for 4 environments"):
+        env.step(still[:3])
+    with pytest.raises(LookupError, match="not in this process"):
+        env.env_method("unreadable", Unreadable(), indices=[0])
+    assert env.get_attr("steps") == [0] * 4
+    env.close()
+    with pytest.raises(RuntimeError, match="the robot's environment is closed"):
+        env.step(still)
+
+
+def test_a_process_that_has_ended_is_one_sentence_whenever_it_is_asked() -> None:
+    env = ProcessVecEnv(Counts, 4, 2)
+    env.reset()
+    process = env._workers[1]._process
+    process.kill()
+    process.wait()
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match=r"has ended by itself \(status -9\)"):
+            env.step(np.zeros((4, 3), np.float32))
+    assert env.get_attr("steps", 0) == [1] or env.get_attr("steps", 0) == [2]
+    env.close()
+
+
+_INTERRUPTED = """
+import os, signal
+import numpy as np
+from sb3_follow_object.common.signals import stop_signals_to
+from sb3_follow_object.envs.robot_copies import ProcessVecEnv
+from test_robot_copies import Counts
+
+env, asked = ProcessVecEnv(Counts, 4, 2), []
+env.reset()
+with stop_signals_to(lambda: asked.append(1)):
+    os.killpg(0, signal.SIGINT)  # what a terminal does on Ctrl-C
+    for _ in range(20):
+        obs = env.step(np.zeros((4, 3), np.float32))[0]
+env.close()
+print(len(asked), obs["achieved_goal"][0, 0])
+"""
+
+
+def test_ctrl_c_in_a_terminal_leaves_the_processes_to_the_training() -> None:
+    here = Path(__file__).parent
+    path = os.pathsep.join([str(here), str(here.parent / "support")])
+    ended = subprocess.run(
+        [sys.executable, "-c", _INTERRUPTED],
+        env={**os.environ, "PYTHONPATH": path},
+        start_new_session=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert (ended.returncode, ended.stdout) == (0, "1 0.0\n"), ended.stderr
 
 
 def test_copies_and_what_judges_goals_are_tuned_and_closed_alike(tmp_path: Path) -> None:
