@@ -60,7 +60,7 @@ class BatchedSimulation(WholeCopies):
         # What mujoco warned of in a copy's episode, and when; None while all is well. Such a copy
         # rests on what it showed last until it is reset.
         self.faults: list[str | None] = [None] * n_envs
-        self.steps = np.zeros(n_envs, dtype=np.int64)
+        self.steps = np.full(n_envs, -1)  # of the episode; -1 before there is one
         self._target_pos = np.zeros((n_envs, 3))
         self._target_quat = np.zeros((n_envs, 4))
         self._connect()
@@ -145,8 +145,10 @@ class BatchedSimulation(WholeCopies):
             actions: (n_envs, action_size), clipped to [-1, 1] here.
 
         Raises:
-            ValueError: an action is not finite.
+            ValueError: an action is not finite, or no episode has begun.
         """
+        if self.steps.min() < 0:
+            raise ValueError("no episode has begun: call reset() first")
         if not np.isfinite(actions).all():
             index = int(np.argwhere(~np.isfinite(actions))[0, 0])
             raise ValueError(

@@ -14,6 +14,7 @@ from gymnasium.utils import seeding
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..common.copies import WholeCopies
+from ..common.numbers import checked_whole
 from ..common.vec_env_copies import let_vec_envs_be_copied
 from .batch import BatchedSimulation
 from .physics_engine import mujoco
@@ -196,16 +197,15 @@ class BatchVecEnv(_GoalFace, VecEnv):
         show_regions: bool,
         max_episode_steps: int | None,
     ) -> None:
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(
-                f"max_episode_steps is {max_episode_steps}; copies that are stepped together need "
-                "episodes of at least 1 step."
-            )
+        if max_episode_steps is not None:  # copies that are stepped together need an end
+            max_episode_steps = checked_whole("max_episode_steps", max_episode_steps, 1)
+        if seed is not None:
+            seed = checked_whole("seed", seed, 0)
         simulation = self.simulation_type(scene, n_envs, n_threads)
         self._start(simulation, reward_type, render_mode, show_regions)
         super().__init__(n_envs, *_spaces(simulation))
         self.metadata = METADATA  # the line above has left out the frames a second
-        self.horizon = scene.task.horizon if max_episode_steps is None else int(max_episode_steps)
+        self.horizon = scene.task.horizon if max_episode_steps is None else max_episode_steps
         self._generators = [seeding.np_random()[0] for _ in range(n_envs)]
         self._actions = np.zeros((n_envs, simulation.action_size))
         if seed is not None:

@@ -43,6 +43,8 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
     check_robotics(name)
     n_envs = checked_whole("n_envs", n_envs, 1)
     seed = options.pop("seed", None)
+    if seed is not None:
+        seed = checked_whole("seed", seed, 0)
     try:
         venv = DummyVecEnv([lambda: gym.make(env_id, **options) for _ in range(n_envs)])
     except gym.error.UnregisteredEnv as error:
@@ -50,7 +52,7 @@ def make_vec(env_id: str, n_envs: int, n_threads: int | None = None, **options: 
         raise ValueError(
             f"Unknown environment id {env_id!r}{did_you_mean(env_id, known)}."
         ) from error
-    except TypeError as error:
+    except (TypeError, gym.error.Error) as error:
         raise ValueError(f"{env_id!r} cannot be made: {error}") from error
     if seed is not None:
         venv.seed(seed)

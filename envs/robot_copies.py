@@ -11,13 +11,13 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection
 from socket import socketpair
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import cloudpickle
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvCreator, EnvSpec, load_env_creator
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from ..common.numbers import checked_whole
@@ -65,7 +65,11 @@ def robot_vec_env(env_id: str, n_envs: int, n_threads: int | None = None, **opti
 def robot_maker(env_id: str, **options: Any) -> Callable[[], gym.Env]:
     """Return what makes one copy of a registered task, with what it lacks of `RobotTask`."""
     spec = gym.spec(import_task(env_id))
-    return partial(_make, spec, _lacks_face(spec, options), options)
+    lacks = _lacks_face(spec, options)
+    if isinstance(spec.entry_point, str) and spec.entry_point.startswith("__main__:"):
+        # Another process has another main program: it is sent what this one's name stands for.
+        spec = replace(spec, entry_point=cast(EnvCreator, load_env_creator(spec.entry_point)))
+    return partial(_make, spec, lacks, options)
 
 
 def with_face(env: gym.Env) -> gym.Env:

@@ -54,8 +54,8 @@ class CurriculumCallback(CopyableCallback):
 
     Raises:
         ValueError: an argument is outside its range, test_env does not show h_max or is in
-            VecNormalize, or training starts in an environment that imagines no goals, with a test_env of another curriculum,
-            or without one where none can be copied.
+            VecNormalize, or training starts in an environment that imagines no goals, with a
+            test_env of another curriculum, or without one where none can be copied.
     """
 
     def __init__(

@@ -95,8 +95,9 @@ class ReachCallback(CopyableCallback):
             self._carry(self.policy)
 
     def _on_training_end(self) -> None:
-        # rl_zoo3 calls this also where the training was refused.
-        if self.policy is not None and self.policy.has_learned:  # whoever plays there now shall see what the learner can do
+        # Whoever plays there now shall see what the learner can do. A training that was refused
+        # has taught nothing; rl_zoo3 ends it all the same.
+        if self.policy is not None and self.policy.has_learned:
             self._ask("set_reach", self.policy.actor(), 0.0)
 
     def _on_step(self) -> bool:

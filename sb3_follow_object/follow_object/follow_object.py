@@ -27,12 +27,15 @@ from ..object_stage.networks import FILE as OBJECT_FILE
 from ..object_stage.networks import ObjectNetworks
 from ..object_stage.sldr import reads_object_networks
 from ..object_stage.stage import ObjectStage
+from ..settings.fields import check_names
 from ..settings.presets import run_config
 from ..settings.run_config import check_plain
 from ..settings.stages import StageSettings
 from .checks import check_algorithms, checked_settings, on_table_for, reach_in
 from .robot_stage import RobotStage
 from .saved_folder import Saved, read, saved_id, write
+
+_OF_AN_ENVIRONMENT = ("env_id", "make_env", "object", "goal", "is_success", "effector")
 
 
 class FollowObject:
@@ -214,8 +217,8 @@ class FollowObject:
         Raises:
             ValueError: an id, a key or a value that cannot be meant, with the nearest that can.
         """
-        own = ("make_env", "object", "goal", "is_success", "effector")
-        given = {name: arguments.pop(name) for name in own if name in arguments}
+        own = [name for name in _OF_AN_ENVIRONMENT if name in arguments]
+        given = {name: arguments.pop(name) for name in own}
         env_id = registered(env_id, **given)
         config = run_config(env_id, method=method, preset=preset, seed=seed, overrides=overrides)
         return cls(env_id, seed=seed, **config.settings, **arguments)
@@ -313,9 +316,13 @@ class FollowObject:
             callback: of SB3, called while the robot trains.
             log_interval: episodes between two log lines of SB3.
             progress_bar: SB3's.
+
+        Raises:
+            ValueError: total_timesteps is no whole number of at least 0.
         """
+        total_timesteps = checked_whole("total_timesteps", total_timesteps, 0)
         self.prepare()
-        remaining = checked_whole("total_timesteps", total_timesteps, 0) - self.env_steps
+        remaining = total_timesteps - self.env_steps
         if remaining > 0:
             self.robot_stage.learn(remaining, callback, log_interval, progress_bar)
         return self
@@ -377,15 +384,20 @@ class FollowObject:
                 given, where an id alone did not say it.
 
         Raises:
-            ValueError: the folder holds no save, or one that is damaged.
+            ValueError: the folder holds no save, a damaged one, or one of another environment.
         """
         folder = Path(folder)
         try:
             env_id = saved_id(folder)
         except (OSError, KeyError, RecursionError, TypeError, ValueError) as error:
             raise ValueError(f"{folder} holds no saved FollowObject ({error})") from error
-        if environment:
-            registered(**environment, named=env_id if made_by_function(env_id) else None)
+        check_names(environment, _OF_AN_ENVIRONMENT, "load()")
+        if environment and not made_by_function(env_id):
+            other = known_id(environment.pop("env_id", env_id))
+            if environment or other != known_id(env_id):
+                raise ValueError(f"{folder} is of {env_id}; load() can make it of no other one")
+        elif environment:
+            registered(**environment, named=env_id)
         elif made_by_function(env_id) and env_id not in gym.registry:
             raise ValueError(
                 f"{folder} is of an environment that came with functions: give load() make_env= "

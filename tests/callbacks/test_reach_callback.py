@@ -217,7 +217,7 @@ def test_a_callback_is_not_taught_with_other_observations() -> None:
         )
 
     other = ReachFirstVecEnv(DummyVecEnv([seen_longer] * N), **REACH)
-    with pytest.raises(ValueError, match="observations and actions of the shapes .* give a new"):
+    with pytest.raises(ValueError, match=r"observations and actions of the shapes .* give a new"):
         learner(other).learn(N * HORIZON, callback)
 
 

@@ -175,9 +175,31 @@ def test_episodes_are_as_long_as_they_are_asked_for(env_id: str) -> None:
     venv.close()
 
 
-def test_a_batch_without_an_end_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"max_episode_steps is -1; .* at least 1 step"):
-        make_vec(TASK, 2, 1, max_episode_steps=-1)
+@pytest.mark.parametrize(
+    ("env_id", "options", "sentence"),
+    [
+        (TASK, {"max_episode_steps": -1}, "max_episode_steps is -1; it must be at least 1"),
+        (TASK, {"max_episode_steps": 2.5}, "max_episode_steps must be a whole number, not 2.5"),
+        (TASK, {"seed": -1}, "seed is -1; it must be at least 0"),
+        ("CartPole-v1", {"seed": "a"}, "seed must be a whole number, not 'a'"),
+        ("Hopper-v1", {}, "'Hopper-v1' cannot be made: .* deprecated"),
+    ],
+)
+def test_a_batch_that_cannot_be_meant_is_refused(
+    env_id: str, options: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        make_vec(env_id, 2, 1, **options)
+
+
+@pytest.mark.parametrize("env_id", [TASK, TASK.replace("-v0", "Object-v0")])
+def test_no_step_before_the_first_reset(env_id: str) -> None:
+    venv = make_vec(env_id, 2, 1)
+    with pytest.raises(ValueError, match=r"no episode has begun: call reset\(\) first"):
+        venv.step(np.zeros((2, *venv.action_space.shape)))
+    venv.reset()
+    venv.step(np.zeros((2, *venv.action_space.shape)))
+    venv.close()
 
 
 def test_other_environments_take_the_length_too() -> None:

@@ -196,6 +196,42 @@ def test_a_process_that_has_ended_is_one_sentence_whenever_it_is_asked() -> None
     env.close()
 
 
+_OF_A_SCRIPT = """
+import gymnasium as gym
+from sb3_follow_object.envs.robot_copies import ProcessVecEnv, robot_vec_env
+from test_robot_copies import Counts
+from toy import HORIZON
+
+class Mine(Counts):
+    ...
+
+gym.register("Mine-v0", "__main__:Mine", max_episode_steps=HORIZON)
+env = robot_vec_env("Mine-v0", 4, 2)
+assert isinstance(env, ProcessVecEnv)
+print(env.reset()["achieved_goal"].shape, env.get_attr("spec")[0].id)
+env.close()
+"""
+
+
+def _run(code: str) -> subprocess.CompletedProcess[str]:
+    """Run a program that may import this module, in a session of its own."""
+    here = Path(__file__).parent
+    path = os.pathsep.join([str(here), str(here.parent / "support")])
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": path},
+        start_new_session=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_an_environment_of_the_script_that_runs_is_known_in_processes() -> None:
+    ended = _run(_OF_A_SCRIPT)
+    assert (ended.returncode, ended.stdout) == (0, "(4, 3) Mine-v0\n"), ended.stderr
+
+
 _INTERRUPTED = """
 import os, signal
 import numpy as np
@@ -215,16 +251,7 @@ print(len(asked), obs["achieved_goal"][0, 0])
 
 
 def test_ctrl_c_in_a_terminal_leaves_the_processes_to_the_training() -> None:
-    here = Path(__file__).parent
-    path = os.pathsep.join([str(here), str(here.parent / "support")])
-    ended = subprocess.run(
-        [sys.executable, "-c", _INTERRUPTED],
-        env={**os.environ, "PYTHONPATH": path},
-        start_new_session=True,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    ended = _run(_INTERRUPTED)
     assert (ended.returncode, ended.stdout) == (0, "1 0.0\n"), ended.stderr
 
 

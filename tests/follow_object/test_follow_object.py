@@ -283,6 +283,33 @@ def test_preset_refuses_what_train_refuses() -> None:
         FollowObject.from_preset(ENV, overrides={"batchsize": 3})
 
 
+@pytest.mark.parametrize("steps", [300_000.0, -1, "many"])
+def test_wrong_steps_are_refused_before_the_object_learns(
+    steps: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = FollowObject(ENV, **TINY)
+    monkeypatch.setattr(run.object_stage, "learn_predictor", lambda: pytest.fail("it learns"))
+    with pytest.raises(ValueError, match="total_timesteps"):
+        run.learn(steps)
+
+
+@pytest.mark.parametrize(
+    ("environment", "sentence"),
+    [
+        ({"env_id": "FollowObject/PnPShelf-v0"}, f"is of {ENV}; load.* can make it of no other"),
+        ({"object": "object0"}, f"is of {ENV}; load.* can make it of no other"),
+        ({"objet": "object0"}, "no setting 'objet'; did you mean 'object'"),
+    ],
+)
+def test_a_save_is_loaded_for_its_own_environment(
+    environment: dict[str, Any], sentence: str, predictor: GoalPredictor, tmp_path: Path
+) -> None:
+    FollowObject(ENV, predictor=predictor, **TINY).save(tmp_path / "save")
+    with pytest.raises(ValueError, match=sentence):
+        FollowObject.load(tmp_path / "save", **environment)
+    assert FollowObject.load(tmp_path / "save", env_id=ENV).env_id == ENV
+
+
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
