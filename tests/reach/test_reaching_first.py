@@ -388,3 +388,13 @@ def test_actions_that_are_changed_on_their_way_to_reaching_are_refused(face: str
                 model.learn(3)
         else:
             model.learn(3 * HORIZON)
+
+
+def test_a_state_of_another_number_of_copies_is_refused() -> None:
+    two, three = (
+        ReachFirstVecEnv(DummyVecEnv([lambda: gym.make(TASK)] * n), **REACH).approach
+        for n in (2, 3)
+    )
+    with pytest.raises(ValueError, match="the saved reaching is of 2 environments, and there are"):
+        three.load_state_dict(two.state_dict())
+    three.load_state_dict(three.state_dict())
