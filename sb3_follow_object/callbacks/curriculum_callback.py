@@ -99,6 +99,10 @@ class CurriculumCallback(CopyableCallback):
         """The curriculum that the tests advance."""
         return imagination_of(self.test_env, _ASKER)[1]
 
+    @property
+    def _replay_buffer(self) -> Any:
+        return getattr(self.model, "replay_buffer", None)
+
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed training needs (JSON types); the curriculum has its own state."""
         return {
@@ -120,7 +124,7 @@ class CurriculumCallback(CopyableCallback):
         if broken_off and not isinstance(self.model, WholeEpisodesDDPG):
             self._begin_new_episodes()
         if self.model.num_timesteps == 0:  # the environment was reset, wherever it stood
-            end_running_episodes(getattr(self.model, "replay_buffer", None))
+            end_running_episodes(self._replay_buffer)
         self._is_training = True
         another = self._trained is not self.model
         if self._trained is not None and self.model.num_timesteps == 0:
@@ -151,7 +155,7 @@ class CurriculumCallback(CopyableCallback):
             self._test_env.seed(int(np.random.randint(2**31 - 1000)))
         elif self._copied is None:
             _check_curriculum(self.training_env, self.curriculum)
-        buffer = getattr(self.model, "replay_buffer", None)
+        buffer = self._replay_buffer
         if buffer is not None:
             follow_env(buffer, self.training_env)
 
@@ -164,7 +168,7 @@ class CurriculumCallback(CopyableCallback):
 
     def _begin_new_episodes(self) -> None:
         model: Any = self.model
-        end_running_episodes(getattr(model, "replay_buffer", None))
+        end_running_episodes(self._replay_buffer)
         model._last_obs = self.training_env.reset()
         model._last_episode_starts = np.ones(self.training_env.num_envs, dtype=bool)
         normaliser = model.get_vec_normalize_env()
@@ -177,7 +181,7 @@ class CurriculumCallback(CopyableCallback):
         model, self._is_training = cast(Any, self.model), False
         if model._last_obs is not self.locals.get("new_obs", model._last_obs):
             model._last_obs = None
-            end_running_episodes(getattr(model, "replay_buffer", None))
+            end_running_episodes(self._replay_buffer)
 
     def _on_step(self) -> bool:
         self._episode_ended |= bool(np.any(self.locals["dones"]))
@@ -227,7 +231,7 @@ class CurriculumCallback(CopyableCallback):
 
     def _open_buffer(self) -> Any:
         """Return the replay buffer if test episodes can go into it now, else None."""
-        buffer = getattr(self.model, "replay_buffer", None)
+        buffer = self._replay_buffer
         if not self.store or buffer is None or self.test_env.num_envs != buffer.n_envs:
             return None
         return buffer if episodes_are_whole(buffer) else None

@@ -85,11 +85,11 @@ class ReachCallback(CopyableCallback):
                 f"{self.policy.tolerance} m, and the environment has {list(told.effector)} within "
                 f"{told.tolerance} m; give a new one"
             )
-        shapes = self.model.observation_space["observation"].shape, self.model.action_space.shape  # type: ignore[index]
-        if shapes != self.policy.shapes:
+        shapes, known = _shapes(self.model), _shapes(self.policy.policy)
+        if shapes != known:
             raise ValueError(
-                f"this ReachCallback was taught with observations and actions of the shapes "
-                f"{self.policy.shapes}, and the environment's are {shapes}; give a new one"
+                f"this ReachCallback was taught with observations and actions of the shapes {known}"
+                f", and the environment's are {shapes}; give a new one"
             )
         if self.policy.has_learned:
             self._carry(self.policy)
@@ -168,3 +168,8 @@ class ReachCallback(CopyableCallback):
             self.model = model
             self.policy = self._make_policy()
             self.policy.load_state_dict(state["policy"])
+
+
+def _shapes(seen: Any) -> tuple[Any, Any]:
+    """Of the observation and the action of a model or a policy."""
+    return seen.observation_space["observation"].shape, seen.action_space.shape

@@ -70,7 +70,6 @@ class ReachPolicy(WholeCopies):
         self.rng = np.random.default_rng(seed)
         observation = observation_space["observation"]
         check_effector(self.effector, observation)
-        self.shapes = observation.shape, action_space.shape
         place = spaces.Box(-np.inf, np.inf, (len(self.effector),), np.float32)
         inputs = spaces.Dict(
             {"observation": observation, "achieved_goal": place, "desired_goal": place}
