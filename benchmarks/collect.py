@@ -36,6 +36,7 @@ from sb3_follow_object.envs import TASKS
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.runs.evaluation import evaluate
 from sb3_follow_object.runs.run_folder import POLICY, difference, noted_command
+from sb3_follow_object.settings.methods import METHODS
 from sb3_follow_object.settings.presets import load_config
 
 HERE = Path(__file__).parent
@@ -319,8 +320,9 @@ def write_summary(rows: list[Row]) -> None:
 def draw(rows: list[Row]) -> None:
     """Write the tables of `compare`, its figures and the curves of the docs."""
     write_tables(read_results(RESULTS), RESULTS)
-    draw_results(RESULTS, RESULTS / "figures")
-    if len({row["method"] for row in rows if row["task"] in TASKS} & {*COMPARED}) > 1:
+    ran = {row["method"] for row in rows if row["task"] in TASKS}
+    draw_results(RESULTS, RESULTS / "figures", [method for method in METHODS if method in ran])
+    if len(ran & {*COMPARED}) > 1:
         draw_methods(RESULTS, RESULTS / "figures" / "reaching.png", COMPARED)
     for task, name in FEATURED.items():
         wanted = [row for row in rows if row["task"] == task and row["method"] in COMPARED]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,7 +37,7 @@ ACROSS_TASKS = "across_tasks.png"
 
 _SHARES = np.linspace(0.0, 1.0, 51)  # of success, and of a task's env steps
 
-_LEGEND_WIDTH = 1.4  # inches of one of its entries
+_NOTE_WIDTH = 76  # characters of a note above a panel
 
 _HATCH = {"hatch": "///", "facecolor": "none", "edgecolor": "0.6", "linewidth": 0.0}
 _BASELINE = "her"  # the paper's HER-a and HER-b
@@ -147,7 +149,7 @@ def _final_success(groups: Sequence[Group], methods: Sequence[str], tasks: Seque
         text = "\n".join(lines)
         axis.text(column, row, text, ha="center", va="center", fontsize=8, color=color)
     image = axis.imshow(medians, vmin=0.0, vmax=1.0, cmap="viridis", aspect="auto")
-    axis.set_xticks(range(len(methods)), methods)
+    axis.set_xticks(range(len(methods)), [_narrow(method) for method in methods], fontsize=8)
     axis.set_yticks(range(len(tasks)), tasks)
     figure.colorbar(image, label="final success, median over seeds")
     return figure
@@ -251,9 +253,10 @@ def _curve_panel(
             xs = curve.columns[x] / unit
             axis.plot(xs, curve.columns["success_rate"], color=color, linestyle=":", marker=".")
     axis.set(xlabel=label, ylabel="success on original goals", ylim=(-0.02, 1.02))
-    axis.set_title(task, pad=16)
     note = "; ".join(f"{what}: {', '.join(names)}" for what, names in notes.items())
-    axis.text(0.5, 1.02, note, transform=axis.transAxes, ha="center", fontsize=7)
+    lines = textwrap.wrap(note, _NOTE_WIDTH)
+    axis.set_title(task, pad=7 + 9 * max(1, len(lines)))
+    axis.text(0.5, 1.02, "\n".join(lines), transform=axis.transAxes, ha="center", fontsize=7)
     axis.grid(alpha=0.3)
     if axis.lines:
         axis.set_xlim(0, None)
@@ -285,8 +288,16 @@ def _legend(figure: Any, methods: Sequence[str]) -> None:
     lines = need("matplotlib.lines", "plots")
     handles = [lines.Line2D([], [], color=_color(methods, m), label=m) for m in methods]
     handles.append(lines.Line2D([], [], color="0.4", linestyle=":", marker=".", label="unfinished"))
-    fit = int(figure.get_figwidth() / _LEGEND_WIDTH)
+    longest = max(len(handle.get_label()) for handle in handles)
+    fit = max(1, int(figure.get_figwidth() / (0.6 + 0.08 * longest)))  # inches of an entry
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), fit))
+
+
+def _narrow(method: str) -> str:
+    """Return a method's name with the settings that tell it apart a line each, without groups."""
+    name, _, settings = method.removesuffix(")").partition(" (")
+    lines = re.split(r", (?=[a-z_.]+=)", settings) if settings else []
+    return "\n".join((name, *(re.sub(r"^[a-z_.]+\.(?=\w+=)", "", line) for line in lines)))
 
 
 def _color(methods: Sequence[str], method: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,23 @@ def test_matrix_of_final_success_has_a_text_in_every_cell(
     assert cells.count("failed") == 1
     assert cells.count("unfinished") == 1
     assert (results / "out" / FINAL_SUCCESS).exists()
+
+
+def test_names_of_variants_are_readable(results: Path, drawn: list[Figure]) -> None:
+    """Runs that differ in settings have long names."""
+    settings = {"object_error": 0.02, "curriculum": {"threshold": 0.25, "stride": 1}}
+    write_run(results, "PnPShelf", "fo", 2, 0.5, **settings)
+    draw_results(results, results / "out", methods=("fo", "her", "rival"))
+    curves, matrix = drawn[1], drawn[3]
+    labels = [label for label in matrix.axes[0].get_xticklabels() if label.get_text()]
+    named = "fo\nobject_error=0.02\nthreshold=0.25\nstride=1"
+    assert named in [label.get_text() for label in labels]
+    boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
+    assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
+    for axis in curves.axes:
+        assert axis.get_window_extent().width > 0.25 * curves.bbox.width
+        notes = [text.get_window_extent() for text in axis.texts]
+        assert all(box.x0 >= 0 and box.x1 <= curves.bbox.width for box in notes)
 
 
 def test_methods_are_compared_across_tasks(tmp_path: Path, drawn: list[Figure]) -> None:
