@@ -6,19 +6,28 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
 
 from ..envs.goal_envs import episode_steps, missing_goal_keys
 
 
 def check_goals(space: spaces.Space) -> None:
-    """Raise a ValueError for observations without goals."""
+    """Raise a ValueError for observations without goals, or which are not vectors of numbers."""
     missing = missing_goal_keys(space)
     if missing:
         raise ValueError(
             f"the environment's observations lack {', '.join(missing)}; HerDDPG needs "
             "a goal environment with observation, achieved_goal and desired_goal"
         )
+    assert isinstance(space, spaces.Dict)
+    for key in ("observation", "desired_goal"):
+        part = space[key]
+        if not isinstance(part, spaces.Box) or is_image_space(part):
+            raise ValueError(
+                f"the observation's {key} is {part}; HerDDPG standardises numbers, and needs a Box "
+                "of them: encode choices and images outside of it"
+            )
 
 
 def check_wrappers(env: Any) -> None:
@@ -50,18 +59,19 @@ def horizon_of(env: Any) -> int:
     return steps
 
 
-def check_rewards(rewards: th.Tensor, clipped_at_0: bool, hindsight_bound: bool) -> None:
+def check_rewards(rewards: th.Tensor, clipped: bool, hindsight_bound: bool) -> None:
     """Raise a ValueError for rewards whose targets would be bounded wrongly.
 
     Args:
         rewards: of a batch.
-        clipped_at_0: whether targets are at most 0, as `target_clip` "auto" has them.
+        clipped: whether targets have the bounds of `target_clip` "auto".
         hindsight_bound: whether they are raised to what episodes of -1 a step prove.
     """
-    if clipped_at_0 and float(rewards.max()) > 0.0:
+    outside = rewards[(rewards > 0.0) | (rewards < -1.0)]
+    if clipped and len(outside):
         raise ValueError(
-            f"a reward is {float(rewards.max()):g}; target_clip 'auto' is for none above "
-            "0: give (low, high), the bounds of the returns, or None"
+            f"a reward is {float(outside[0]):g}; target_clip 'auto' is for rewards from -1 "
+            "to 0: give (low, high), the bounds of the returns, or None"
         )
     if hindsight_bound and not bool(((rewards == 0.0) | (rewards == -1.0)).all()):
         raise ValueError(

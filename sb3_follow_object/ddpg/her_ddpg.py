@@ -95,13 +95,16 @@ class HerDDPG(KeptDDPG):
     The other arguments are DDPG's.
 
     Raises:
-        ValueError: for an environment without goals, in VecNormalize or in VecFrameStack, an
-            argument outside its range, or, at the first update, rewards above 0 with `target_clip`
-            "auto" or others than -1 and 0 with `hindsight_bound`.
+        ValueError: for an environment without goals or with images, in VecNormalize or in
+            VecFrameStack, an argument outside its range, or, at the first update, rewards outside
+            of [-1, 0] with `target_clip` "auto" or others than -1 and 0 with `hindsight_bound`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": HerPolicy}
     replay_buffer: FollowObjectReplayBuffer | None
+    # Of `train_freq` in episodes of several environments: as asked for, and what it stands for.
+    _episodes: TrainFreq | None = None
+    _steps_of_episodes: TrainFreq | None = None
 
     def __init__(
         self,
@@ -242,11 +245,19 @@ class HerDDPG(KeptDDPG):
                 )
         self._updates = Updates(self)
         self._device_replay = self._make_device_replay()
-        if isinstance(self.train_freq, TrainFreq) and (
-            self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1
-        ):
+        self._follow_horizon()
+
+    def _follow_horizon(self) -> None:
+        """Turn episodes of several environments, which SB3 does not count, into steps of each."""
+        if self.env is None:
+            return
+        assert isinstance(self.train_freq, TrainFreq)
+        if self.train_freq == self._steps_of_episodes:
+            self.train_freq = self._episodes
+        if self.train_freq.unit == TrainFrequencyUnit.EPISODE and self.n_envs > 1:
+            self._episodes = self.train_freq
             steps = self.train_freq.frequency * horizon_of(self.env)
-            self.train_freq = TrainFreq(steps, TrainFrequencyUnit.STEP)
+            self.train_freq = self._steps_of_episodes = TrainFreq(steps, TrainFrequencyUnit.STEP)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
@@ -268,6 +279,7 @@ class HerDDPG(KeptDDPG):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:  # noqa: D102
         makes_replay = self.replay_buffer is None
         super().set_env(env, force_reset)
+        self._follow_horizon()
         warn_of_other_planes(self.policy.mirrors, self.env)
         if makes_replay:
             self._device_replay = self._make_device_replay()

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from ..common.copies import WholeCopies
@@ -57,6 +59,21 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
             names += [f"auxiliary_critic.{name}" for name in self.auxiliary_critic.optimizers]
         return names, variables
 
+    def set_parameters(  # noqa: D102
+        self,
+        load_path_or_dict: str | TensorDict,
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        self._leave_graphs()
+
+    def _leave_graphs(self) -> None:
+        """Forget what optimisers need in graphs on CUDA, which set it themselves."""
+        for optimizer in (self.actor.optimizer, self.critic.optimizer):
+            for group in optimizer.param_groups:
+                group["capturable"] = False
+
     def training_state(self) -> dict[str, Any]:
         """Return everything that the next rollout and update depend on, between rollouts.
 
@@ -94,9 +111,7 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
         self.policy.load_state_dict(state["policy"])
         load_optimizer(self.actor.optimizer, state["actor_optimizer"])
         load_optimizer(self.critic.optimizer, state["critic_optimizer"])
-        for optimizer in (self.actor.optimizer, self.critic.optimizer):
-            for group in optimizer.param_groups:
-                group["capturable"] = False  # of graphs on CUDA, which set it themselves
+        self._leave_graphs()
         if self.auxiliary_critic is not None:
             self.auxiliary_critic.load_training_state(state["auxiliary"])
         assert self.replay_buffer is not None

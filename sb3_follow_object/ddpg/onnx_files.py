@@ -81,6 +81,10 @@ def _policy_of(model: Any) -> BasePolicy:
 def _inputs(space: spaces.Space) -> dict[str, spaces.Space]:
     """Return the spaces of the file's inputs by name, each with draws of its own."""
     named = dict(space.spaces) if isinstance(space, spaces.Dict) else {_ONLY_INPUT: space}
+    if _OUTPUT in named:
+        raise ValueError(
+            f"the observation has a key {_OUTPUT!r}, as the output of an ONNX file; rename it"
+        )
     named = copy.deepcopy(named)
     for part in named.values():
         part.seed(0)

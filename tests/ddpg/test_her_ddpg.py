@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -210,6 +211,26 @@ def test_episodes_of_several_environments() -> None:
         HerDDPG("MultiInputPolicy", DummyVecEnv([PointEnv]))
 
 
+def test_episodes_of_several_environments_are_those_of_the_one_that_it_has(tmp_path: Any) -> None:
+    def reach(n_envs: int, steps: int) -> DummyVecEnv:
+        make = partial(gym.make, "FetchReach-v4", max_episode_steps=steps)
+        return DummyVecEnv([make] * n_envs)
+
+    def freq_of(model: HerDDPG) -> tuple[int, str]:
+        return model.train_freq.frequency, model.train_freq.unit.value  # type: ignore[union-attr]
+
+    file = tmp_path / "model"
+    model = HerDDPG("MultiInputPolicy", reach(2, 50), buffer_size=1000)
+    assert freq_of(model) == (50, "step")
+    model.save(file)
+    assert freq_of(HerDDPG.load(file, env=reach(2, 30))) == (30, "step")
+    assert freq_of(HerDDPG.load(file, env=reach(2, 30), train_freq=20)) == (20, "step")
+    assert freq_of(HerDDPG.load(file, env=reach(1, 30))) == (1, "episode")
+    loaded = HerDDPG.load(file)
+    loaded.set_env(reach(2, 30))
+    assert freq_of(loaded) == (30, "step")
+
+
 def test_same_seed_same_result() -> None:
     results = []
     for seed in (0, 0, 1):
@@ -336,11 +357,50 @@ class Paid(PointEnv):
         return super().compute_reward(achieved, desired, info) + 1.0
 
 
-def test_rewards_above_the_bounds_of_targets_are_refused() -> None:
-    env = DummyVecEnv([Paid] * 4)
-    with pytest.raises(ValueError, match="a reward is 1; target_clip 'auto' is for none above 0"):
+class Far(PointEnv):
+    """Rewards of minus a distance, in centimetres."""
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> np.ndarray:
+        return -100.0 * np.linalg.norm(np.subtract(achieved, desired), axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("made", "said", "bounds"), [(Paid, "1", (0.0, 10.0)), (Far, "-[0-9.]+", (-1000.0, 0.0))]
+)
+def test_rewards_beyond_the_bounds_of_targets_are_refused(
+    made: type[PointEnv], said: str, bounds: tuple[float, float]
+) -> None:
+    env = DummyVecEnv([made] * 4)
+    with pytest.raises(ValueError, match=f"a reward is {said}; target_clip 'auto' is for rewards"):
         HerDDPG("MultiInputPolicy", env, **TINY).learn(100)
-    HerDDPG("MultiInputPolicy", env, **TINY, target_clip=(0.0, 10.0)).learn(100)
+    HerDDPG("MultiInputPolicy", env, **TINY, target_clip=bounds).learn(100)
+
+
+@pytest.mark.parametrize(
+    "part", [gym.spaces.Box(0, 255, (8, 8, 1), np.uint8), gym.spaces.MultiDiscrete([3, 2])]
+)
+def test_observations_that_are_no_numbers_are_refused(part: gym.spaces.Space) -> None:
+    """SB3 prepares them in `predict`, where HerDDPG standardises what is stored."""
+
+    class Seen(PointEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            entries = dict(self.observation_space.spaces)  # type: ignore[attr-defined]
+            self.observation_space = gym.spaces.Dict({**entries, "observation": part})
+
+    with pytest.raises(ValueError, match=r"the observation's observation is .*needs a Box"):
+        HerDDPG("MultiInputPolicy", DummyVecEnv([Seen]), **TINY)
+
+
+def test_a_model_trained_in_graphs_is_loaded_without_them(tmp_path: Any) -> None:
+    model = make_model(policy_kwargs={"net_arch": [8], "optimizer_kwargs": {"fused": False}})
+    model.learn(100, log_interval=None)  # type: ignore[arg-type]
+    for group in model.actor.optimizer.param_groups:
+        group["capturable"] = True  # as training on CUDA leaves it
+    model.save(tmp_path / "model")
+    loaded = HerDDPG.load(tmp_path / "model", env=model.env)
+    loaded.learn(100, log_interval=None)  # type: ignore[arg-type]
+    assert not any(group["capturable"] for group in loaded.actor.optimizer.param_groups)
 
 
 def test_a_bound_that_the_replay_buffer_cannot_give_is_refused() -> None:

@@ -137,3 +137,19 @@ def test_file_that_acts_otherwise_is_not_written(
 def test_what_has_no_policy_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="takes an SB3 algorithm or policy that exists, not None"):
         export_onnx(None, tmp_path / "policy.onnx")
+
+
+def test_an_input_named_as_the_output_is_refused(tmp_path: Path) -> None:
+    class Repeats(toy.PointEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            entries = dict(self.observation_space.spaces)  # type: ignore[attr-defined]
+            entries["action"] = entries["observation"]
+            self.observation_space = spaces.Dict(entries)
+
+        def _observe(self) -> dict[str, np.ndarray]:
+            obs = super()._observe()
+            return {**obs, "action": obs["observation"]}
+
+    with pytest.raises(ValueError, match="the observation has a key 'action'"):
+        export_onnx(SAC("MultiInputPolicy", Repeats(), **tiny()), tmp_path / "policy.onnx")
