@@ -311,6 +311,8 @@ class FollowObject:
     ) -> FollowObject:
         """Train until `env_steps` reaches `total_timesteps`; may be called again with more.
 
+        The object's stage comes first and runs to its own end, however few `total_timesteps` are.
+
         Args:
             total_timesteps: env steps in all, object stage and tests included.
             callback: of SB3, called while the robot trains.
@@ -325,6 +327,11 @@ class FollowObject:
         remaining = total_timesteps - self.env_steps
         if remaining > 0:
             self.robot_stage.learn(remaining, callback, log_interval, progress_bar)
+        elif self.object_steps >= total_timesteps > 0:
+            self.report(
+                f"the object's stage took {self.object_steps:,} env steps of {total_timesteps:,}: "
+                "none were left for the robot"
+            )
         return self
 
     def predict(

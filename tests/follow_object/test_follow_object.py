@@ -293,6 +293,17 @@ def test_wrong_steps_are_refused_before_the_object_learns(
         run.learn(steps)
 
 
+def test_steps_that_end_with_the_objects_stage_are_told() -> None:
+    said: list[str] = []
+    run = FollowObject(ENV, **TINY, report=said.append).learn(1000)
+    assert run.object_steps >= 1600
+    assert run.env_steps == run.object_steps
+    assert said[-1].endswith(
+        f"{run.object_steps:,} env steps of 1,000: none were left for the robot"
+    )
+    run.close()
+
+
 @pytest.mark.parametrize(
     ("environment", "sentence"),
     [
