@@ -14,7 +14,7 @@ from ..imagination.goal_env import LAST
 from ..settings.sizes import check_buffer
 from .episode_table import EpisodeTable
 from .record_buffer import Gathered, RecordReplayBuffer
-from .steps import lost_steps
+from .steps import fitted, lost_steps, told
 
 GRAVITY = 9.81  # m/s^2
 _EPISODES = 1000  # whose goals say where goals lie
@@ -63,12 +63,13 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
 
         Raises:
             ValueError: an array has another shape than the environments', or holds NaN or infinity,
-                or a wrapper changed the action before it was replaced; nothing is stored.
+                an info lacks what others hold, or a wrapper changed the action before it was
+                replaced; nothing is stored.
         """
         if self.n_added == 0:
             self.check_size()
         next_obs = self._with_last_observations(next_obs, done, infos)
-        if EXECUTED in infos[0]:
+        if any(EXECUTED in info for info in infos):
             action = self._executed(action, infos)
         pos = self.pos
         rows = [
@@ -79,11 +80,15 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         kept = (
             [(store[pos], store[pos].copy()) for store in self._stores().values()] if rows else []
         )
+        shared = self.goals_are_shared
         try:
             # What is too small for float32 becomes 0, what is too large is refused.
             with np.errstate(under="ignore", over="ignore"):
                 self._write(obs, next_obs, action, reward, done, infos)
-        except ValueError:
+                self._write_facts(infos)
+        except BaseException:
+            if self.goals_are_shared != shared:
+                self._share_goals(shared)
             for slot, content in kept:
                 slot[...] = content
             raise
@@ -95,17 +100,22 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         self.ep_start[pos] = self._current_ep_start
         if self.copy_info_dict:
             self.infos[pos] = infos
-        if self.original_goals.size:
-            shown = obs["desired_goal"]
-            self.original_goals[pos] = [
-                info.get("original_goal", goal) for info, goal in zip(infos, shown, strict=True)
-            ]
-            if self.contexts.size:
-                self.contexts[pos] = [info["context"] for info in infos]
         self.pos = (pos + 1) % self.buffer_size
         self.full |= self.pos == 0
         self.n_added += 1
         self._end_finished(np.asarray(done, dtype=bool).reshape(self.n_envs), infos)
+
+    def _write_facts(self, infos: list[dict[str, Any]]) -> None:
+        """Write what infos say of goals that were not shown, and of other things' places."""
+        if not self.original_goals.size:
+            return
+        pos, shape = self.pos, self.original_goals.shape[2:]
+        shown = self.observations["desired_goal"][pos]
+        for env_idx, (info, goal) in enumerate(zip(infos, shown, strict=True)):
+            goal = fitted(info.get("original_goal", goal), shape, "the original goal")
+            self.original_goals[pos, env_idx] = goal
+        if self.contexts.size:
+            self.contexts[pos] = told(infos, "context", self.contexts.shape[2:])
 
     def _with_last_observations(
         self, next_obs: dict[str, np.ndarray], done: np.ndarray, infos: list[dict[str, Any]]
@@ -134,15 +144,17 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
 
     def _executed(self, chosen: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """Return what was executed in place of the actions chosen, both scaled (n_envs, d)."""
-        if GIVEN in infos[0]:
-            given = self._scaled(np.stack([info[GIVEN] for info in infos]))
+        shape = self.action_space.shape
+        assert shape is not None
+        if any(GIVEN in info for info in infos):
+            given = self._scaled(told(infos, GIVEN, shape))
             if not np.allclose(given, chosen, rtol=0.0, atol=1e-4):
                 raise ValueError(
                     "a wrapper outside of ReachFirstWrapper changes the actions on their way to "
                     "it, so what it tells to have executed is none of the policy's: put "
                     "ReachFirstWrapper outside of that wrapper"
                 )
-        return self._scaled(np.stack([info[EXECUTED] for info in infos]))
+        return self._scaled(told(infos, EXECUTED, shape))
 
     def _scaled(self, actions: np.ndarray) -> np.ndarray:
         """Scale an environment's actions (n_envs, action_dim) to [-1, 1], as they are stored."""
@@ -166,12 +178,18 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         """End running episodes where they stand, as a time limit would: they are sampled then.
 
         Args:
-            env_indices: of the environments, by default all, (n,) int.
+            env_indices: of the environments, by default all, (n,) int; where none runs, none ends.
         """
-        if env_indices is None:
-            env_indices = np.flatnonzero(self._current_ep_start != self.pos)
-        for env_idx in env_indices:
-            self._compute_episode_length(int(env_idx))
+        for env_idx in range(self.n_envs) if env_indices is None else env_indices:
+            # One as long as the buffer would start here too, but the step that filled it ended it.
+            if self._current_ep_start[env_idx] != self.pos:
+                self._compute_episode_length(int(env_idx))
+
+    def reset(self) -> None:
+        """Forget all steps and episodes, as a new buffer has none."""
+        super().reset()
+        self.table = EpisodeTable()
+        self.n_added = 0
 
     def _forget_episode(self, row: int) -> None:
         """Make an episode that is about to be overwritten invisible to sampling."""

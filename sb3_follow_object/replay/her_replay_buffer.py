@@ -21,7 +21,7 @@ from .cher import GoalSelection
 from .episode_buffer import EpisodeReplayBuffer
 from .episode_table import EpisodeTable
 from .record_buffer import NEXT_DESIRED
-from .steps import check_copies
+from .steps import check_actions, check_copies
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
 Strategy = GoalSelectionStrategy | str
@@ -72,8 +72,9 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
     The other arguments are HerReplayBuffer's.
 
     Raises:
-        ValueError: an argument is outside its range, imagined goals are asked for without the
-            wrapper that imagines them, or, at the first step, an episode does not fit.
+        ValueError: an argument is outside its range, actions have no bounds, imagined goals are
+            asked for without the wrapper that imagines them, or, at the first step, an episode does
+            not fit.
     """
 
     goal_margin = scene_distance = 0.0  # of buffers pickled before there were any
@@ -121,6 +122,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         )
         n_envs = checked_whole("n_envs", n_envs, 1)
         buffer_size = checked_whole("buffer_size", buffer_size, 1)
+        check_actions(action_space)
         super().__init__(
             buffer_size,
             observation_space,
@@ -167,7 +169,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         # Whether that is where other episodes' goals lie and its own does not.
         self._amiss = np.zeros(self.dones.shape if self.scene_distance > 0.0 else (0,), dtype=bool)
         self.table = EpisodeTable()
-        self.revision = 0  # counts contents that were loaded over the earlier ones
+        self.revision = 0  # counts how often the content was loaded or forgotten
 
     def set_env(self, env: VecEnv) -> None:
         """Ask another environment for rewards and imagined goals from now on.
@@ -221,6 +223,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             raise ValueError("a replay buffer's state has no infos: leave copy_info_dict out")
         used = self.buffer_size if self.full else self.pos
         return {
+            "buffer_size": self.buffer_size,
             "pos": self.pos,
             "full": self.full,
             "current_episode_start": self._current_ep_start,
@@ -231,21 +234,19 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict` of a buffer of the same shape.
+        """Continue from `state_dict` of a buffer of the same shape and size.
 
         Raises:
-            ValueError: the state belongs to a buffer with other stores or shapes.
+            ValueError: the state belongs to a buffer with other stores, shapes or slots, or to one
+                without the `cher` that this one has; nothing is changed.
         """
+        self._check_content(state)
+        if self.selection is not None and state["selection"] is None:
+            raise ValueError("the saved replay buffer was without cher, and this one has it")
         slots = state["slots"]
         self._share_goals(NEXT_DESIRED not in slots)
-        stores = self._stores()
-        if set(stores) != set(slots) or any(
-            len(slots[name]) > len(store) or slots[name].shape[1:] != store.shape[1:]
-            for name, store in stores.items()
-        ):
-            raise ValueError("the saved replay buffer has another shape than this one")
         self.ep_length[:] = 0  # of episodes that are there now
-        for name, store in stores.items():
+        for name, store in self._stores().items():
             store[: len(slots[name])] = slots[name]
         self.pos, self.full = state["pos"], state["full"]
         self.revision += 1
@@ -254,6 +255,16 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         self.rng.bit_generator.state = state["rng"]
         if self.selection is not None:
             self.selection.load_state_dict(state["selection"])
+
+    def reset(self) -> None:
+        """Forget everything that was stored; only the generator goes on from where it is.
+
+        A `HerDDPG` whose buffer this is has to be told, by its `expect_new_replay`.
+        """
+        super().reset()
+        self.revision += 1
+        if self.selection is not None:
+            self.selection.n_batches = 0
 
     def _stores(self) -> dict[str, np.ndarray]:
         stores = super()._stores()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,6 +116,22 @@ class RecordReplayBuffer(WholeCopies, HerReplayBuffer):
         stores = RecordReplayBuffer._stores(self).values()
         self._checked = [store for store in stores if store.dtype.kind == "f"]
 
+    def reset(self) -> None:
+        """Forget all steps: the arrays are as in a new buffer."""
+        used = self.size()
+        if self._can_share_goals():
+            self._share_goals(True)
+        for store in self._stores().values():
+            store[:used] = 0
+        for at in np.ndindex(self.infos[:used].shape):
+            self.infos[at] = {}
+        self._current_ep_start[:] = 0
+        super().reset()
+
+    def _can_share_goals(self) -> bool:
+        """Whether desired goals are in the records, so that those of next ones need no array."""
+        return DESIRED in self.records.views()
+
     def _share_goals(self, shared: bool) -> None:
         """Store desired goals of observations and next observations once, or twice."""
         self.goals_are_shared = shared
@@ -204,6 +221,27 @@ class RecordReplayBuffer(WholeCopies, HerReplayBuffer):
         for name in ("actions", "ep_start", "ep_length"):
             stores[name] = getattr(self, name)
         return {name: store for name, store in stores.items() if name not in views}
+
+    def _check_content(self, state: Mapping[str, Any]) -> None:
+        """Raise a ValueError unless a saved content fits: "pos", "full", "slots", "buffer_size"."""
+        slots, full = state["slots"], state["full"]
+        shapes = {name: store.shape[1:] for name, store in self._stores().items()}
+        if self._can_share_goals():
+            shapes.pop(NEXT_DESIRED, None)
+            if NEXT_DESIRED in slots:
+                shapes[NEXT_DESIRED] = self.observations["desired_goal"].shape[1:]
+        if {name: slot.shape[1:] for name, slot in slots.items()} != shapes:
+            raise ValueError("the saved replay buffer has another shape than this one")
+        used = len(slots["records"])
+        # Older states do not tell their size: a full one's is `used`, another's is more than that.
+        size = state.get("buffer_size", used if full else max(used + 1, self.buffer_size))
+        if size != self.buffer_size:
+            raise ValueError(
+                f"the saved replay buffer needs room for {size} steps of each environment, and "
+                f"this one has room for {self.buffer_size}: give it the saved one's buffer_size"
+            )
+        if any(len(slot) != (size if full else state["pos"]) for slot in slots.values()):
+            raise ValueError("the saved replay buffer holds another number of steps than it says")
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 
 def check_copies(n_envs: int, n_copies: int) -> None:
@@ -14,6 +15,19 @@ def check_copies(n_envs: int, n_copies: int) -> None:
         raise ValueError(
             f"the replay buffer holds steps of {n_envs} environments; this one has {n_copies} "
             "copies"
+        )
+
+
+def check_actions(space: spaces.Space) -> None:
+    """Raise a ValueError unless a space's actions can be scaled to [-1, 1], as they are stored."""
+    if not isinstance(space, spaces.Box):
+        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        width = np.subtract(space.high, space.low, dtype=np.result_type(space.dtype, np.float32))
+    if not ((width > 0.0) & np.isfinite(width)).all():
+        raise ValueError(
+            "the action space must have finite bounds, each low below its high, to be scaled to "
+            f"[-1, 1]; it is {space}"
         )
 
 
@@ -27,6 +41,21 @@ def fitted(array: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     if array.size != int(np.prod(shape)):
         raise ValueError(f"{what} has the shape {array.shape}, not {shape}")
     return array.reshape(shape)
+
+
+def told(infos: Sequence[Mapping[str, Any]], key: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return what each environment's info says under a key, (n_envs, *shape).
+
+    Raises:
+        ValueError: an info lacks it, or it holds another number of numbers.
+    """
+    for env_idx, info in enumerate(infos):
+        if key not in info:
+            raise ValueError(
+                f"every environment's info must hold {key!r}; that of environment {env_idx} does "
+                "not"
+            )
+    return np.stack([fitted(info[key], shape, f"the info {key!r}") for info in infos])
 
 
 def refuse_infinite(arrays: Mapping[str, np.ndarray]) -> None:

@@ -130,6 +130,12 @@ def test_refresh_brings_what_was_stored_since() -> None:
     for n_steps in (0, 7, 20, 35, 90):
         fill([buffer], env, n_steps)
         check(buffer)
+    for n_steps in (13, 3):
+        buffer.reset()
+        with pytest.raises(RuntimeError, match="no finished episode yet"):
+            replay.refresh(buffer)
+        fill([buffer], env, n_steps + HORIZON, seed=n_steps)
+        check(buffer)
     buffer.load_state_dict(copy.deepcopy(other.state_dict()))
     check(buffer)
     fill([other], env, 3)
@@ -182,6 +188,32 @@ def test_rewards_of_known_environments_are_recognised() -> None:
     task = "FollowObject/PushSideGap-v0"
     assert DistanceReward.of(make_vec(task, 1), 3).threshold == 0.05
     assert DistanceReward.of(make_vec(task, 1, reward_type="dense"), 3).threshold is None
+
+
+@pytest.mark.parametrize("bound", [0.3, 0.5, 10.0])
+def test_minus_a_distance_that_is_bounded_is_not_taken_for_minus_the_distance(bound: float) -> None:
+    class BoundedPointEnv(PointEnv):
+        def compute_reward(self, achieved: Any, desired: Any, info: Any) -> np.ndarray:
+            return -np.minimum(np.linalg.norm(np.subtract(achieved, desired), axis=-1), bound)
+
+    with pytest.raises(ValueError, match="compute_reward gives others"):
+        DistanceReward.of(make_env(1, BoundedPointEnv), 3)
+
+
+@pytest.mark.parametrize("goal_size", [1, 3, 30])
+def test_rewards_are_recognised_in_either_precision(goal_size: int) -> None:
+    class DoublePointEnv(PointEnv):
+        def compute_reward(self, achieved: Any, desired: Any, info: Any) -> np.ndarray:
+            return super().compute_reward(achieved.astype(np.float64), desired, info)
+
+    class DoubleDensePointEnv(DensePointEnv):
+        def compute_reward(self, achieved: Any, desired: Any, info: Any) -> np.ndarray:
+            return super().compute_reward(achieved.astype(np.float64), desired, info)
+
+    for env_class in (PointEnv, DoublePointEnv):
+        assert DistanceReward.of(make_env(1, env_class), goal_size).threshold == THRESHOLD
+    for env_class in (DensePointEnv, DoubleDensePointEnv):
+        assert DistanceReward.of(make_env(1, env_class), goal_size).threshold is None
 
 
 def test_what_needs_the_host_is_refused_in_a_sentence() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from numbered import ALGORITHMS, learner
 from small_buffers import as_arrays, fill, make_buffer, make_env
 from stable_baselines3 import HerReplayBuffer
@@ -184,18 +186,100 @@ def test_a_step_that_does_not_fit_is_not_stored(change: Any, sentence: str) -> N
     assert buffer.table.n_transitions() == 9
 
 
-def test_a_step_that_is_refused_leaves_the_episode_that_it_would_overwrite() -> None:
-    buffer = make_buffer(make_env(3), size=6)
-    for value in range(3):  # two slots: the third step overwrites the first
+def full_of_steps(**options: Any) -> Any:
+    """Two slots of three environments: the third step has overwritten the first."""
+    buffer = make_buffer(make_env(3), size=6, **options)
+    for value in range(3):
         step = a_step()
         step["obs"]["observation"] = np.full((3, 3), float(value))
         buffer.add(**step)
+    return buffer
+
+
+def lacks_an_observation(step: dict[str, Any]) -> None:
+    step["next_obs"].pop("observation")
+
+
+@pytest.mark.parametrize("moves", [False, True], ids=["still", "moving goal"])
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        (with_goal(np.full((3, 3), np.nan), "next_obs"), "NaN"),
+        (lambda step: step["next_obs"].update(observation=np.full((3, 3), np.nan)), "NaN"),
+        (lambda step: step.update(infos=[{}] * 2), "there are 2 infos for 3"),
+        (lacks_an_observation, "observation"),
+    ],
+)
+def test_a_step_that_is_refused_leaves_all_as_it_was(change: Any, error: str, moves: bool) -> None:
+    buffer = full_of_steps()
+    before = copy.deepcopy(buffer)
     step = a_step()
-    step["next_obs"]["desired_goal"] = np.full((3, 3), np.nan)
-    with pytest.raises(ValueError, match="NaN"):
+    step["obs"]["observation"] = np.full((3, 3), 9.0)
+    if moves:
+        step["next_obs"]["desired_goal"] = np.full((3, 3), 2.0)
+    change(step)
+    with pytest.raises((ValueError, KeyError), match=error):
         buffer.add(**step)
     assert buffer.table.n_transitions() == 6
+    assert buffer.goals_are_shared
+    assert buffer.next_observations["desired_goal"] is buffer.observations["desired_goal"]
+    for name, store in before._stores().items():
+        np.testing.assert_array_equal(buffer._stores()[name], store, err_msg=name)
     assert set(buffer.sample(100).observations["observation"].ravel().tolist()) == {1.0, 2.0}
+
+
+@pytest.mark.parametrize("key", ["executed_action", "given_action"])
+@pytest.mark.parametrize("lacking", [0, 2])
+def test_what_was_executed_is_told_of_every_environment_or_refused(key: str, lacking: int) -> None:
+    told = {"executed_action": np.full(3, 0.5, np.float32), "given_action": np.zeros(3, np.float32)}
+    buffer, step = full_of_steps(), a_step()
+    step["infos"] = [{**info, **told} for info in step["infos"]]
+    buffer.add(**step)
+    assert (buffer.actions[1] == 0.5).all()
+    del step["infos"][lacking][key]
+    with pytest.raises(ValueError, match=f"must hold '{key}'; that of environment {lacking} does"):
+        buffer.add(**step)
+    step["infos"][lacking][key] = np.zeros(2)
+    with pytest.raises(ValueError, match=rf"the info '{key}' has the shape \(2,\), not \(3,\)"):
+        buffer.add(**step)
+    assert buffer.table.n_transitions() == 6 and buffer.n_added == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda info: info.pop("context"), "must hold 'context'; that of environment 1 does not"),
+        (lambda info: info.update(context=np.zeros(3)), r"'context' has the shape \(3,\), not \(2"),
+        (lambda info: info.update(original_goal=np.zeros(2)), "the original goal has the shape"),
+    ],
+)
+def test_facts_that_do_not_fit_lose_no_older_step(change: Any, sentence: str) -> None:
+    buffer = full_of_steps(scene_distance=0.01)
+    buffer.contexts = np.zeros((2, 3, 2), np.float32)
+    step = a_step()
+    step["infos"] = [{**info, "context": np.ones(2)} for info in step["infos"]]
+    buffer.add(**step)
+    assert (buffer.contexts[1] == 1.0).all() and (buffer.contexts[0] == 0.0).all()
+    before = copy.deepcopy(buffer)
+    change(step["infos"][1])
+    step["obs"]["observation"] = np.full((3, 3), 9.0)
+    with pytest.raises(ValueError, match=sentence):
+        buffer.add(**step)
+    assert buffer.table.n_transitions() == 6 and buffer.pos == before.pos
+    for name, store in before._stores().items():
+        np.testing.assert_array_equal(buffer._stores()[name], store, err_msg=name)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 0.0), (-1.0, np.inf), (-np.inf, np.inf)])
+def test_actions_that_cannot_be_scaled_are_refused_at_once(low: float, high: float) -> None:
+    class Odd(PointEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            bounds = np.array([-1.0, -1.0, low]), np.array([1.0, 1.0, high])
+            self.action_space = spaces.Box(*(each.astype(np.float32) for each in bounds))
+
+    with pytest.raises(ValueError, match=r"the action space must have finite bounds.* it is Box"):
+        make_buffer(make_env(1, Odd))
 
 
 def test_what_float32_cannot_tell_from_zero_is_zero() -> None:

@@ -125,6 +125,26 @@ def test_an_episode_as_long_as_the_buffer_is_cut_there() -> None:
         np.testing.assert_array_equal(stored[slots[1:]], later[slots[:-1]])
 
 
+@pytest.mark.parametrize("env_indices", [[0], [0, 0], [1], None])
+def test_where_no_episode_runs_none_is_ended(env_indices: list[int] | None) -> None:
+    env = make_env()
+    buffer = make_buffer(env, size=120)
+    for n_steps, stored in ((2 * HORIZON, 40), (4, 44 if env_indices else 48)):
+        fill([buffer], env, n_steps)
+        for _ in range(2):
+            buffer.end_episodes(None if env_indices is None else np.array(env_indices))
+            assert buffer.table.n_transitions() == stored
+    assert buffer.table.length.max() == HORIZON
+
+
+def test_an_episode_that_ends_as_the_buffer_is_full_is_kept_whole() -> None:
+    env = make_env()
+    buffer = make_buffer(env, size=2 * HORIZON)
+    fill([buffer], env, HORIZON)
+    buffer.end_episodes(np.array([0, 1]))
+    assert buffer.table.facts[buffer.table.length > 0, 1:3].tolist() == [[0, 10], [1, 10]]
+
+
 class Raises(BaseCallback):
     def _on_step(self) -> bool:
         return True
