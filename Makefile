@@ -59,7 +59,7 @@ docs: $(INSTALLED)
 
 # The tables of settings in the docs are what the code says.
 settings: $(INSTALLED)
-	$(BIN)/python -m sb3_follow_object.settings.table docs/runs.md
+	$(BIN)/python -m sb3_follow_object.settings.docs_tables docs/runs.md
 
 # torch goes first and by its pin: a range would let pip fetch a newer build with CUDA.
 $(INSTALLED): pyproject.toml constraints.txt

@@ -41,7 +41,8 @@ def zoo_command(options: argparse.Namespace) -> list[str]:
     return [
         *(sys.executable, "-m", "rl_zoo3.train", "--gym-packages", "sb3_follow_object"),
         *("--algo", options.algo, "--env", options.env, "--conf-file", options.conf_file),
-        *("-n", str(options.steps), "--seed", str(options.seed), "--num-threads", "1"),
+        *("-n", str(options.steps), "--seed", str(options.seed)),
+        *("--num-threads", str(options.threads)),
         *("--eval-freq", str(EVAL_EVERY), "--eval-episodes", str(EVAL_EPISODES)),
         *("-f", str(options.run / "logs"), "--log-interval", "100"),
     ]
@@ -117,6 +118,7 @@ def main() -> None:
     parser.add_argument("--conf-file", required=True)
     parser.add_argument("--steps", type=int, required=True, help="of the robot and its tests")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=1, help="of PyTorch")
     parser.add_argument("--method", help="in the table; sb3-ALGO by default")
     parser.add_argument("--run", type=Path, required=True, help="a new folder")
     options = parser.parse_args()

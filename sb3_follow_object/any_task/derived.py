@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -90,12 +92,13 @@ def derived(env_id: str, report: Report = lambda sentence: None) -> Derived:
     if name not in gym.registry:
         raise ValueError(f"there is no environment {env_id!r}")
     key = registration_key(gym.registry[name])
-    if key not in _LOOKED_AT:
-        _LOOKED_AT[key] = _look(name, report)
-    return _LOOKED_AT[key]
+    looked_at = _LOOKED_AT.get(name)
+    if looked_at is None or looked_at[0] != key:
+        looked_at = _LOOKED_AT[name] = key, _look(name, report)
+    return looked_at[1]
 
 
-_LOOKED_AT: dict[Any, Derived] = {}
+_LOOKED_AT: dict[str, tuple[Any, Derived]] = {}  # by id, each as it was registered
 
 
 def object_horizon(horizon: int) -> int:
@@ -153,8 +156,9 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
         )
     within = success_distance(env, few.goals[:5])
     others = [b for b in varying_bodies(model, few) if b != found.body]
-    drawn = _drawn(env_id, env, few, others, horizon, within)
-    physics = physics_digest_of(model, found.body, found.offset, few, drawn)
+    again, model_again, _ = record_resets(env, 2)
+    drawn = _drawn(env_id, few, again, others, horizon, within)
+    physics = physics_digest_of(model, found.body, found.offset, few, drawn, model_again)
     resets = _kept_resets(env_id, env, physics, report)
     task = DerivedTask(env_id, object_horizon(horizon), physics)
     context = context_of(model, resets, found.body)
@@ -267,10 +271,9 @@ def _second(seen: Observed, found: Candidate) -> float | None:
 
 
 def _drawn(
-    env_id: str, env: gym.Env, few: Resets, others: list[int], horizon: int, within: float
+    env_id: str, few: Resets, again: Resets, others: list[int], horizon: int, within: float
 ) -> str:
     """What decides how episodes are drawn: of the first ones what seeds say again."""
-    again, _, _ = record_resets(env, 2)
     arrays = [(few.goals, again.goals), (few.starts, again.starts)]
     arrays += [(few.places[:, body], again.places[:, body]) for body in sorted(others)]
     episodes: list[Any] = []
@@ -284,16 +287,30 @@ def _kept_resets(env_id: str, env: gym.Env, physics: str, report: Report) -> Res
     """Return the recorded resets of a task, recorded now unless they are kept from before."""
     folder = cache_folder() / env_id / physics
     path = folder / _FILE
-    if path.exists():
-        return Resets.load(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(
-            f"{folder} cannot be written ({error.strerror or error}); {SET_THE_VARIABLE}"
-        ) from error
-    with lock(folder, wait=True):
-        if not path.exists():
+    kept = _whole_resets(path)
+    if kept is not None:
+        return kept
+    with ExitStack() as held:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            held.enter_context(lock(folder, wait=True))
+        except OSError as error:
+            raise ValueError(
+                f"{folder} cannot be written ({error.strerror or error}); {SET_THE_VARIABLE}"
+            ) from error
+        if _whole_resets(path) is None:
             report(f"where {N_RESETS} episodes of {env_id} begin is recorded, once")
             record_resets(env, N_RESETS)[0].save(path)
     return Resets.load(path)
+
+
+def _whole_resets(path: Path) -> Resets | None:
+    """Return the resets that a file holds; None, there is none, or a damaged one."""
+    if not path.exists():
+        return None
+    try:
+        return Resets.load(path)
+    except ValueError as error:
+        if isinstance(error.__cause__, OSError):  # it may be whole, but cannot be read
+            raise
+        return None

@@ -54,6 +54,7 @@ def registered(
     if (env_id is None) == (make_env is None):
         raise ValueError("give an environment's id, or make_env, a function that makes it")
     extras = (object, goal, is_success, effector)
+    given: tuple[Any, ...]
     if make_env is None and all(extra is None for extra in extras):
         assert env_id is not None
         return env_id
@@ -62,18 +63,22 @@ def registered(
         name = import_task(env_id)
         if name not in gym.registry:
             raise ValueError(f"there is no environment {env_id!r}")
-        make_env = partial(make_registered, gym.spec(name))
-        title, _, version = name.rpartition("/")[2].rpartition("-v")
+        spec = gym.spec(name)
+        make_env = partial(make_registered, spec)
+        title, version, given = spec.name, spec.version or 0, (spec, *extras)
     else:
         title = getattr(make_env, "__name__", type(make_env).__name__)
-        title, version = re.sub(r"\W+", "", title) or "environment", "0"
-    given = (make_env, *extras)
+        title, version = re.sub(r"\W+", "", title) or "environment", 0
+        given = (make_env, *extras)
     ours = _free_id(title, version, given) if named is None else named
     if not _alike(_GIVEN.get(ours, given), given):
         raise ValueError(f"{ours!r} is another environment here; load it in a process of its own")
     horizon = _horizon(make_env, ours)
+    before, now = _REGISTERED.get(ours), (horizon, *given, *_around(given))
+    _GIVEN[ours], _REGISTERED[ours] = given, now
+    if ours in gym.registry and _unchanged(before, now):  # what was found out of it stays known
+        return ours
     gym.registry.pop(ours, None)
-    _GIVEN[ours] = given
     entry = partial(_make, make_env, *extras)
     gym.register(ours, entry, max_episode_steps=horizon, disable_env_checker=True)
     return ours
@@ -82,6 +87,7 @@ def registered(
 # What of compiled code is in its words, and not in the lines that they stand on.
 _WORDS = tuple(f"co_{name}" for name in ("code", "consts", "names", "varnames", "freevars"))
 _GIVEN: dict[str, tuple[Any, ...]] = {}  # what each id was registered with
+_REGISTERED: dict[str, tuple[Any, ...]] = {}  # and what that found around it
 
 
 def made_by_function(env_id: str) -> bool:
@@ -89,11 +95,25 @@ def made_by_function(env_id: str) -> bool:
     return env_id.startswith(f"{NAMESPACE}/")
 
 
-def _free_id(title: str, version: str, given: tuple[Any, ...]) -> str:
+def _free_id(title: str, version: int, given: tuple[Any, ...]) -> str:
     """Return the first id of this name that is free, or that these functions have already."""
     titles = itertools.chain([title], (f"{title}-{n}" for n in itertools.count(2)))
     names = (f"{NAMESPACE}/{each}-v{version}" for each in titles)
     return next(name for name in names if _alike(_GIVEN.get(name, given), given))
+
+
+def _around(given: tuple[Any, ...]) -> tuple[Any, ...]:
+    """What functions call by its name, which a notebook may write anew without them."""
+    functions = (each for each in given if isinstance(each, FunctionType))
+    return tuple(f.__globals__.get(name) for f in functions for name in f.__code__.co_names)
+
+
+def _unchanged(one: Any, other: Any) -> bool:
+    """Whether two things are one, written once."""
+    try:
+        return bool(one == other)
+    except Exception:  # what cannot be compared is another thing
+        return False
 
 
 def _alike(one: Any, other: Any) -> bool:

@@ -60,7 +60,10 @@ class Resets:
             ValueError: the file is missing or damaged.
         """
         tree = load_tree(path)
-        return cls(**{each.name: tree[each.name] for each in fields(cls)})
+        try:
+            return cls(**{each.name: tree[each.name] for each in fields(cls)})
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"{path} holds no recorded resets") from error
 
 
 def record_resets(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,12 +18,23 @@ from .resets import Resets, varying_bodies
 STEP = 0.04  # seconds of an env step, as in the package's own tasks
 POINT, PULLER = "followed:point", "followed:mocap"
 _LEAST_MASS = 1e-9  # kg
-# What decides the object's motion and does not change from episode to episode.
-_PHYSICS = (
-    "geom_type geom_pos geom_quat geom_size geom_contype geom_conaffinity geom_condim "
-    "geom_friction geom_margin geom_gap geom_solref geom_solimp jnt_type jnt_axis jnt_range "
-    "jnt_stiffness dof_damping dof_frictionloss dof_armature"
+# Fields of a model that decide no object's motion; every other one is taken to.
+_NO_PHYSICS = re.compile(
+    r"""
+    (cam | light | mat | site | skin | tex)_  # looks; sites mark goals
+    | mesh_(face)?(normal | texcoord)
+    | \w+_(rgba | group | matid | width | pathadr)$
+    | (names? | key | numeric | text | tuple | sensor)_  # what is told or measured
+    | \w+_user$
+    | actuator_ | \w+_actuatorid$  # the robot's
+    # What MuJoCo makes of the rest.
+    | (B | D | M | bvh | efm0 | oct | ten | tree)_ | map | mesh_(graph | poly | pos | quat | scale)
+    | \w+_(bvhadr | bvhnum | octadr | octnum | sameframe | simple | simplenum | treeid)$
+    | \w+_(M0 | Madr | aabb | invweight0 | length | length0 | rbound | subtreemass)$
+    """,
+    re.VERBOSE,
 )
+_POSES = ("body_pos", "body_quat")
 
 
 @dataclass(frozen=True)
@@ -123,11 +135,17 @@ def object_scene_of(
 
 
 def physics_digest_of(
-    model: mujoco.MjModel, body: int, offset: np.ndarray, resets: Resets, drawn: str
+    model: mujoco.MjModel,
+    body: int,
+    offset: np.ndarray,
+    resets: Resets,
+    drawn: str,
+    again: mujoco.MjModel | None = None,
 ) -> str:
     """A short hash of what decides how the object moves and where goals lie.
 
-    Where bodies stand in one episode or another is left out, since it may not repeat itself.
+    Where bodies stand in one episode or another is left out, since it may not repeat itself, and
+    so is what is only seen.
 
     Args:
         model: of the robot's environment.
@@ -135,21 +153,46 @@ def physics_digest_of(
         offset: of its point, (3,).
         resets: a few.
         drawn: what decides how episodes are drawn, as far as that is known.
+        again: the model after another reset with the same seed; numbers of which no seed says what
+            they are differ in it, and are left out.
     """
-    varying = varying_bodies(model, resets)
-    parts = [str(body), drawn, f"{model.opt.timestep:.9g}", str(model.opt.gravity)]
-    fixed = [b for b in range(model.nbody) if b not in varying and b != body]
-    arrays = {
-        "offset": offset.round(6),
-        "body_pos": model.body_pos[fixed].round(6),
-        "body_mass": model.body_mass,
-        "body_inertia": model.body_inertia,
-        **{name: getattr(model, name) for name in _PHYSICS.split()},
-    }
-    for name, values in arrays.items():
-        flat = np.asarray(values, dtype=np.float64).ravel() + 0.0  # no -0
-        parts.append(name + " ".join(f"{value:.7g}" for value in flat))
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+    varying = sorted(varying_bodies(model, resets))
+    point = " ".join(f"{value:.6f}" for value in offset.round(6) + 0.0)
+    digest = hashlib.sha256(f"{body}\n{drawn}\n{point}".encode())
+    fields = _physics_fields(model)
+    repeated = fields if again is None else _physics_fields(again)
+    for name, values in fields.items():
+        same = repeated.get(name)
+        if same is None or same.shape != values.shape:
+            continue
+        values = np.where(values == same, values, 0)
+        if name in _POSES:
+            values[varying] = 0.0
+            values = values.round(6)
+        kind = "<f4" if values.dtype.kind == "f" else "<i8"
+        digest.update(f"\n{name} {values.shape} ".encode() + (values + 0).astype(kind).tobytes())
+    return digest.hexdigest()[:12]
+
+
+def _physics_fields(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """What of a model decides how things move in it, by the names of its fields.
+
+    Options that are MuJoCo's own and fields that say nothing are left out, or each MuJoCo that has
+    one more would have other physics.
+    """
+    usual, fields = mujoco.MjOption(), {}
+    for name in dir(model.opt):
+        if not name.startswith("_"):
+            values = np.atleast_1d(getattr(model.opt, name))
+            if not np.array_equal(values, np.atleast_1d(getattr(usual, name))):
+                fields[f"opt_{name}"] = values
+    for name in dir(model):
+        if name.startswith("_") or _NO_PHYSICS.match(name):
+            continue
+        values = getattr(model, name)
+        if isinstance(values, np.ndarray) and not any((values == none).all() for none in (0, -1)):
+            fields[name] = values
+    return fields
 
 
 def _heaviest(model: mujoco.MjModel, body: int) -> int:

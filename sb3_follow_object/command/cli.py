@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..common.reports import Trouble, reason
 from . import demo, export, picture, report
+from .arguments import check_agreed, check_methods, overrides_of, policy_of
 from .cli_options import PROGRAM, USER_ERROR, make_parser
 from .picture_names import CURVE, IMAGINED, TASK, VIDEO
 from .streams import leave_streams, open_streams
@@ -67,7 +68,13 @@ def _sentence(error: Exception) -> str:
     """Say in one line what went wrong."""
     if isinstance(error, MemoryError):
         return f"there is not enough memory ({error})"
-    return reason(error)
+    said = reason(error)
+    if isinstance(error, ValueError):
+        from ..envs.goal_envs import SAY_GOALS
+
+        if said.endswith(SAY_GOALS):  # which Python alone can
+            said += ", as arguments of RobotTask in a module of your own (docs/own_task.md)"
+    return said
 
 
 def _train(args: argparse.Namespace) -> None:
@@ -139,20 +146,17 @@ def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> Non
 def _config(args: argparse.Namespace) -> RunConfig:
     """Return the configuration that the flags describe."""
     from ..comparison.cells import unread
-    from ..settings.presets import parse_override, run_config
+    from ..settings.presets import run_config
 
     if args.env is None:
         raise ValueError("say which task to train with --env, e.g. --env FollowObject/PnPShelf-v0")
-    overrides = {"n_timesteps": args.steps, "n_envs": args.n_envs}
-    overrides |= {"n_threads": args.threads, "torch_threads": args.threads}
-    overrides = {name: value for name, value in overrides.items() if value is not None}
     config = run_config(
         args.env,
         method=args.method,
         preset=args.preset or "default",
         file=args.config,
         seed=args.seed or 0,
-        overrides=overrides | dict(parse_override(text) for text in args.set),
+        overrides=overrides_of(args),
     )
     for text in args.set:
         if why := unread(text.split("=")[0], config):
@@ -163,6 +167,7 @@ def _config(args: argparse.Namespace) -> RunConfig:
 def _resumed_config(args: argparse.Namespace) -> RunConfig:
     """Return the folder's configuration; flags may repeat it and change only the steps."""
     from ..settings.presets import load_config
+    from ..settings.stages import StageSettings
 
     config = load_config(args.run)
     if args.steps is not None:
@@ -171,7 +176,7 @@ def _resumed_config(args: argparse.Namespace) -> RunConfig:
         "env": (args.env, config.full_id),
         "method": (args.method, config.method),
         "seed": (args.seed, config.seed),
-        "n-envs": (args.n_envs, config.settings.get("n_envs")),
+        "n-envs": (args.n_envs, config.settings.get("n_envs", StageSettings.n_envs)),
         "threads": (args.threads, config.torch_threads),
     }
     for name, (given, kept) in said.items():
@@ -179,7 +184,8 @@ def _resumed_config(args: argparse.Namespace) -> RunConfig:
             raise ValueError(f"the run in {args.run} has --{name} {kept}, not {given}")
     if args.set or args.config or args.preset:
         args.env, args.method, args.seed = config.full_id, config.method, config.seed
-        args.steps = config.total_timesteps
+        if not any(text.startswith("n_timesteps=") for text in args.set):
+            args.steps = config.total_timesteps
         return _config(args)  # train() compares it with the folder's
     return config
 
@@ -187,14 +193,15 @@ def _resumed_config(args: argparse.Namespace) -> RunConfig:
 def _evaluate(args: argparse.Namespace) -> None:
     from ..comparison.cross import cross_test
     from ..runs.evaluation import evaluate
-    from ..runs.run_folder import POLICY, trained_steps
+    from ..runs.run_folder import trained_steps
     from ..settings.presets import load_config
 
     config = load_config(args.run)
     env_id = args.env or config.env_id
     seed = config.seed if args.seed is None else args.seed
+    policy = policy_of(args.run)
     if env_id in (config.env_id, config.full_id):
-        episodes = evaluate(args.run / POLICY, env_id, args.episodes, seed)
+        episodes = evaluate(policy, env_id, args.episodes, seed)
         rate, reached = episodes.success_rate, float(episodes.reached.mean())
     else:
         rate, reached = cross_test(args.run, env_id, args.episodes, seed, _warn), None
@@ -230,13 +237,12 @@ def _warn(sentence: str) -> None:
 
 
 def _watch(args: argparse.Namespace) -> None:
-    from ..runs.run_folder import POLICY
     from ..settings.presets import load_config
     from .pictures import record
 
     config = load_config(args.run)
     out = _named(args.out or args.run / VIDEO, ".mp4")
-    rate = record(args.run / POLICY, config.env_id, out, args.episodes, args.seed)
+    rate = record(policy_of(args.run), config.env_id, out, args.episodes, args.seed)
     print(f"{out}: success {rate:.2f} of {args.episodes}")
 
 
@@ -272,7 +278,9 @@ def _compare(args: argparse.Namespace) -> None:
     from ..envs.batch import cores
     from ..settings.presets import parse_override
 
+    check_methods(args.methods)
     overrides = dict(parse_override(text) for text in args.set)
+    check_agreed("steps", args.steps, overrides)
     settings = Settings(args.steps, args.preset, overrides, args.paper_evaluation)
     grid = (args.out, args.tasks, args.methods, args.seeds, settings)
     n_runs = len(plan(*grid))  # what cannot be meant is refused before a cluster is asked for

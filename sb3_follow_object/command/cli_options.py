@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..settings.methods import METHODS
+from ..settings.methods import METHODS, who_trains
 from . import completion, demo, export, picture, report
 from .picture_names import CURVE, VIDEO
 
@@ -32,6 +33,8 @@ class Parser(argparse.ArgumentParser):
         choice = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
         option = re.search(r"unrecognized arguments: (--[\w-]+)", message)
         near: list[str] = []
+        if choice and (who := who_trains(choice[1])):
+            return f"; {who}"
         if choice:
             near = get_close_matches(choice[1], re.findall(r"[\w-]+", choice[2]), n=1)
         elif option:
@@ -99,7 +102,7 @@ def _add_train(subparsers: Any) -> None:
     train.add_argument("--method", choices=METHODS, help="default: fo")
     train.add_argument(
         "--steps",
-        type=int,
+        type=_whole,
         metavar="N",
         help="env steps, all stages counted; with --resume: other ones than before",
     )
@@ -159,7 +162,7 @@ def _add_compare(subparsers: Any) -> None:
     compare.add_argument(
         "--seeds", nargs="+", type=int, default=[0], metavar="N", help="default: 0"
     )
-    compare.add_argument("--steps", type=int, metavar="N", help="env steps of each run")
+    compare.add_argument("--steps", type=_whole, metavar="N", help="env steps of each run")
     compare.add_argument("--preset", choices=("default", "paper"), default="default")
     _add_set(compare)
     compare.add_argument(
@@ -184,6 +187,17 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--preset", choices=("default", "paper"), help="settings of the package")
     source.add_argument("--config", type=Path, metavar="FILE.yml", help="settings of your own")
     _add_set(parser)
+
+
+def _whole(text: str) -> int:
+    """Read a whole number, also as 1e6 and 1_000_000."""
+    try:
+        return int(text)
+    except ValueError:
+        with suppress(ValueError):
+            if (number := float(text)).is_integer():
+                return int(number)
+        raise argparse.ArgumentTypeError(f"invalid int value: {text!r}") from None
 
 
 def _add_set(parser: argparse.ArgumentParser) -> None:

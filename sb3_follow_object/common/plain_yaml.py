@@ -11,6 +11,7 @@ from .reports import reason
 SIZE_LIMIT = 1 << 17  # characters
 NODES_LIMIT = 20_000  # after every alias has been replaced by what it stands for
 DEPTH_LIMIT = 32
+_MERGE = "tag:yaml.org,2002:merge"
 
 
 def load_yaml(text: str) -> Any:
@@ -20,7 +21,8 @@ def load_yaml(text: str) -> Any:
     beyond `NODES_LIMIT` (a "billion laughs").
 
     Raises:
-        ValueError: the text is not YAML, is too large or too deep, or holds anything else.
+        ValueError: the text is not YAML, is too large or too deep, holds anything else, or gives a
+            key twice.
     """
     if len(text) > SIZE_LIMIT:
         raise ValueError(f"it has {len(text)} characters, more than {SIZE_LIMIT}")
@@ -55,11 +57,25 @@ def _count(node: Any, known: dict[int, int | None], depth: int) -> int:
     if isinstance(node, yaml.SequenceNode):
         total += sum(_count(item, known, depth + 1) for item in node.value)
     elif isinstance(node, yaml.MappingNode):
+        _check_keys(node)
         total += sum(_count(item, known, depth + 1) for pair in node.value for item in pair)
     if total > NODES_LIMIT:
         raise ValueError(f"its aliases stand for more than {NODES_LIMIT} values")
     known[id(node)] = total
     return total
+
+
+def _check_keys(node: Any) -> None:
+    """Raise a ValueError for a key that a mapping has twice; what is merged into it may have it."""
+    lines: dict[tuple[str, str], int] = {}
+    for key, _ in node.value:
+        if not isinstance(key, yaml.ScalarNode) or key.tag == _MERGE:
+            continue
+        line = key.start_mark.line + 1
+        if (key.tag, key.value) in lines:
+            first = lines[key.tag, key.value]
+            raise ValueError(f"{key.value!r} is given in line {first} and again in line {line}")
+        lines[key.tag, key.value] = line
 
 
 def _check_plain(value: Any) -> None:

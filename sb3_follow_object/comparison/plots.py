@@ -15,8 +15,9 @@ import numpy as np
 
 from ..common.extras import need
 from ..common.files import atomic_write
-from ..runs.run_folder import EVALUATIONS, flat
+from ..runs.run_folder import EVALUATIONS
 from ..settings.presets import load_config
+from ..settings.run_config import flat
 from .results import words_apart
 
 X_AXES = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time (minutes)", 60.0)}

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from ..common.files import atomic_write
-from ..runs.run_folder import CONFIG, RESULT, VERSIONS, flat, noted_command, read_result
+from ..runs.run_folder import CONFIG, RESULT, VERSIONS, noted_command, read_result
 from ..settings.presets import load_config
+from ..settings.run_config import flat
 from .grid import task_name
 from .plots import Curve, read_curve, spread
 from .results import FINISHED, Run, group_runs, ordered, read_results, table_rows

@@ -16,9 +16,10 @@ import numpy as np
 from ..common.extras import MissingExtra
 from ..common.files import atomic_write
 from ..envs import TASKS
-from ..runs.run_folder import CONFIG, RESULT, flat, read_result, trained_steps
+from ..runs.run_folder import CONFIG, RESULT, read_result, trained_steps
 from ..settings.methods import METHODS
 from ..settings.presets import load_config
+from ..settings.run_config import flat
 from .cells import task_name
 from .ledger import ATTEMPTS, read_grid
 from .statistics import (

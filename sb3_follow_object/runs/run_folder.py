@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.files import LOCK, atomic_write
-from ..settings.run_config import CONFIG, RunConfig
+from ..settings.run_config import CONFIG, RunConfig, flat
 from .checkpoints import checkpoint_files
 
 RESULT, EVALUATIONS = "result.json", "evaluations.csv"
@@ -65,15 +65,6 @@ def difference(kept: dict[str, Any], wanted: dict[str, Any]) -> tuple[str, Any, 
         if ours.get(name) != theirs.get(name):
             return name, ours.get(name), theirs.get(name)
     return None
-
-
-def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested settings by their dotted names."""
-    named: dict[str, Any] = {}
-    for name, value in tree.items():
-        nested = flat(value, f"{prefix}{name}.") if isinstance(value, dict) else None
-        named |= {f"{prefix}{name}": value} if nested is None else nested
-    return named
 
 
 def claim(folder: Path, config: RunConfig, command: str = "") -> None:

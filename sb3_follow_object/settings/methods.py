@@ -2,3 +2,13 @@
 
 METHODS = ("fo", "her", "shaped", "rnd", "sldr", "cher", "fo-sldr", "rher")
 WITHOUT_PAPER = ("rher",)  # the paper has no such rival, so there is no preset of its settings
+# Stock algorithms, which have no presets here, and the files that rl_zoo3 trains them with.
+STOCK = {"ddpg": "ddpg.yml", "td3": "ddpg.yml", "sac": "sac.yml", "tqc": "sac.yml"}
+
+
+def who_trains(name: str) -> str:
+    """Say who trains a stock algorithm; "" where a name is not one's."""
+    file = STOCK.get(name.lower())
+    if file is None:
+        return ""
+    return f"rl_zoo3 trains stock algorithms, {name} with zoo_configs/{file} (docs/sb3.md)"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from ..any_task.tasks import (
     success_distance_of,
     surface_choices,
 )
+from ..common.numbers import as_number
 from ..common.plain_yaml import load_yaml
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, object_id
@@ -29,6 +31,7 @@ from .methods import WITHOUT_PAPER
 from .run_config import CONFIG, RunConfig
 from .sizes import check_sizes
 from .stages import ReachFirstSettings, ReachTeachingSettings, StageSettings, part_of_reach
+from .table import check_dotted
 
 PRESETS = ("default", "paper")
 # Settings in metres that are meant as shares of the distance within which goals are reached.
@@ -130,6 +133,7 @@ def run_config(
     for name, value in (overrides or {}).items():
         _override(changes, name, value)
         _override(settings, name, value)
+    check_dotted(changes, "--set")
     _checked(changes, "--set")
     settings = _checked(settings, str(path))
     if settings.get("auxiliary"):
@@ -341,11 +345,16 @@ def _object_stage(entry: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _scale_distances(settings: dict[str, Any], factor: float) -> None:
-    """Fit what presets say in metres to how near its goal an object must be."""
+    """Fit what presets say in metres to how near its goal an object must be.
+
+    What cannot be meant is left to be refused as it was given.
+    """
     for outer, name in _TOLERANCES:
         group = settings.get(outer)
         if isinstance(group, dict) and name in group:
-            settings[outer] = {**group, name: round(group[name] * factor, 6)}
+            with suppress(ValueError):
+                if (metres := as_number(group[name])) > 0:
+                    settings[outer] = {**group, name: round(metres * factor, 6)}
 
 
 def _fit_to_horizon(settings: dict[str, Any], horizon: int) -> None:

@@ -127,3 +127,12 @@ def check_plain(settings: Mapping[str, Any], file: str) -> None:
             raise ValueError(
                 f"{name} is {shown(value)}, a Python object, which {file} cannot hold"
             ) from error
+
+
+def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings by their dotted names."""
+    named: dict[str, Any] = {}
+    for name, value in tree.items():
+        nested = flat(value, f"{prefix}{name}.") if isinstance(value, dict) else None
+        named |= {f"{prefix}{name}": value} if nested is None else nested
+    return named

@@ -1,13 +1,9 @@
-"""Every setting with its values, default and sentence: for the command line and for the docs.
-
-`python -m sb3_follow_object.settings.table docs/runs.md` writes the tables of the docs anew.
-"""
+"""Every setting with its values, default and sentence: for the command line and for the docs."""
 
 from __future__ import annotations
 
 import json
-import sys
-from pathlib import Path
+from collections.abc import Iterable
 
 from ..common.suggestions import did_you_mean
 from .fields import Group, Setting, settings_of
@@ -41,7 +37,6 @@ GROUPS: dict[type[Group], str] = {
     PredictorSettings: "predictor_fit.",
     InverseSettings: "inverse_fit.",
 }
-BEGIN, END = "<!-- settings: written by", "<!-- settings: end -->\n"
 
 
 def listed(group: type[Group]) -> list[Setting]:
@@ -68,28 +63,6 @@ def default(each: Setting) -> str:
     return json.dumps(each.default).strip('"')
 
 
-def markdown() -> str:
-    """Return the tables of the docs."""
-    parts = []
-    for group in GROUPS:
-        rows = [
-            f"| `{each.name}` | {values(each)} | {default(each)} | {each.sentence} |\n"
-            for each in listed(group)
-        ]
-        head = f"{group.title}:\n\n| name | values | default | |\n|---|---|---|---|\n"
-        parts.append(head + "".join(rows))
-    return "\n".join(parts)
-
-
-def with_tables(text: str) -> str:
-    """Return a page with the tables between its marks written anew."""
-    before, mark, rest = text.partition(BEGIN)
-    if not mark or END not in rest:
-        raise ValueError(f"there are no marks {BEGIN} ... {END.strip()}")
-    comment = rest[: rest.index("\n") + 1]
-    return f"{before}{mark}{comment}\n{markdown()}\n{END}{rest.partition(END)[2]}"
-
-
 def lines(name: str | None = None) -> list[str]:
     """Return what there is to say of every setting, or of those with this name or below it.
 
@@ -99,16 +72,41 @@ def lines(name: str | None = None) -> list[str]:
     Raises:
         ValueError: there is none of that name, with the nearest that there is.
     """
-    found = {
-        f"{prefix}{each.name}": each for group, prefix in GROUPS.items() for each in listed(group)
-    }
+    found = _dotted()
     wanted = found if name is None else _below(found, name)
     if not wanted:
-        raise ValueError(f"there is no setting {name!r}{did_you_mean(str(name), found)}")
+        meant = _nested(str(name)) or did_you_mean(str(name), found)
+        raise ValueError(f"there is no setting {name!r}{meant}")
     return [
         f"{dotted}: {values(each)}, default {default(each)}; {each.sentence}"
         for dotted, each in wanted.items()
     ]
+
+
+def check_dotted(names: Iterable[str], where: str) -> None:
+    """Raise a ValueError for a name that a setting has in its group alone.
+
+    Args:
+        names: that stand for themselves, without their group's.
+        where: beginning of the sentence.
+    """
+    known = _dotted()
+    for name in names:
+        if name not in known and (meant := _nested(name)):
+            raise ValueError(f"{where} has no setting {name!r}{meant}")
+
+
+def _nested(name: str) -> str:
+    """The end of a sentence about a name that only settings of groups have; "" where none has."""
+    meant = [repr(dotted) for dotted in _dotted() if dotted.endswith(f".{name}")]
+    return f"; did you mean {' or '.join(meant)}?" if meant else ""
+
+
+def _dotted() -> dict[str, Setting]:
+    """Return every setting by its dotted name."""
+    return {
+        f"{prefix}{each.name}": each for group, prefix in GROUPS.items() for each in listed(group)
+    }
 
 
 def _below(found: dict[str, Setting], name: str) -> dict[str, Setting]:
@@ -117,8 +115,3 @@ def _below(found: dict[str, Setting], name: str) -> dict[str, Setting]:
     if first == "object_algorithm" and rest:
         return {f"{first}.{dotted}": each for dotted, each in _below(found, rest).items()}
     return {n: each for n, each in found.items() if f"{n}.".startswith(f"{name}.")}
-
-
-if __name__ == "__main__":
-    for file in map(Path, sys.argv[1:]):
-        file.write_text(with_tables(file.read_text()))

@@ -301,6 +301,24 @@ def test_recorded_resets_are_kept_for_the_same_physics(monkeypatch: pytest.Monke
     assert len(said) == 2 and other.physics != first.physics
 
 
+def test_damaged_resets_are_recorded_anew_and_others_told(tmp_path: Path) -> None:
+    first = derived("Tidy-v0")
+    (path,) = tmp_path.rglob("resets.safetensors")
+    whole = path.read_bytes()
+    for damaged in (whole[:-100], b"", b"text", whole.replace(b"goals", b"gaols")):
+        path.write_bytes(damaged)
+        module._LOOKED_AT.clear()
+        said: list[str] = []
+        again = derived("Tidy-v0", said.append)
+        assert len(said) == 1 and path.read_bytes() == whole
+        np.testing.assert_array_equal(again.resets.goals, first.resets.goals)
+    path.unlink()
+    path.mkdir()
+    module._LOOKED_AT.clear()
+    with pytest.raises(ValueError, match="Is a directory"):
+        derived("Tidy-v0")
+
+
 def test_recorded_resets_are_those_of_what_stands_elsewhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

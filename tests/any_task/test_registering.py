@@ -12,7 +12,9 @@ import toy
 from gymnasium.wrappers import TimeLimit
 
 from sb3_follow_object import fingertips
+from sb3_follow_object.any_task import derived as deriving
 from sb3_follow_object.any_task import registering
+from sb3_follow_object.any_task.derived import derived
 from sb3_follow_object.any_task.registering import registered
 from sb3_follow_object.envs.robot_copies import ProcessVecEnv, robot_maker, robot_vec_env
 
@@ -150,3 +152,39 @@ def test_the_same_functions_have_one_id_and_others_another() -> None:
     assert judged == registered(arm_and_wall.ARM, is_success=near)
     with pytest.raises(ValueError, match="is another environment here"):
         registered(make_env=pushed_arm, named=first)
+
+
+class Renamed(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
+    """The same under another name."""
+
+
+def test_what_is_registered_again_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks: list[str] = []
+    monkeypatch.setattr(deriving, "_LOOKED_AT", {})
+    monkeypatch.setattr(deriving, "_look", lambda name, report: looks.append(name) or len(looks))
+    kinds: list[dict[str, Any]] = [
+        {"make_env": make_my_arm, "object": "box"},
+        {"env_id": arm_and_wall.ARM, "is_success": near},
+    ]
+    for arguments in kinds:
+        looks.clear()
+        first = derived(registered(**arguments))
+        assert derived(registered(**arguments)) == first == 1
+    assert len(deriving._LOOKED_AT) == 2
+    namespace = {"TimeLimit": TimeLimit, "Arm": arm_and_wall.ArmAndWall}
+    exec("def made():\n    return TimeLimit(Arm(), 50)\n", namespace)
+    looks.clear()
+    ids = [registered(make_env=namespace["made"])]
+    derived(ids[0])
+    namespace["Arm"] = Renamed  # a notebook's cell above, run again
+    ids.append(registered(make_env=namespace["made"]))
+    derived(ids[1])
+    assert ids[0] == ids[1] and looks == ids, "what it makes may be another"
+    assert len(deriving._LOOKED_AT) == 3, "and what the old one was is forgotten"
+
+
+def test_ids_without_a_version_or_with_a_namespace_keep_their_name() -> None:
+    for env_id in ("Unversioned", "mine/Spaced-v3"):
+        gym.register(env_id, arm_and_wall.ArmAndWall, max_episode_steps=30)  # type: ignore[attr-defined]
+    assert registered("Unversioned", object="box") == "Followed/Unversioned-v0"
+    assert registered("mine/Spaced-v3", object="box") == "Followed/Spaced-v3"

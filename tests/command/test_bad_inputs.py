@@ -29,9 +29,10 @@ def test_corpus_is_as_large_as_was_promised() -> None:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the broken run folders that the corpus speaks of."""
     config = json.dumps(asdict(run_config(TASK)))
-    for name in ("CONFIG", "BADCONFIG", "BADPOLICY"):
+    for name in ("CONFIG", "ENDED", "BADCONFIG", "BADPOLICY"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").write_text("{" if name == "BADCONFIG" else config)
+    (tmp_path / "ENDED" / "result.json").write_text("{}")
     (tmp_path / "BADPOLICY" / "policy.safetensors").write_bytes(bytes(100))
     monkeypatch.chdir(tmp_path)
 

@@ -63,6 +63,8 @@ def test_plain_trees_come_back_as_they_were(tmp_path_factory, tree: object) -> N
         ("a: !!python/name:os.system", "could not determine a constructor"),
         ("x" * 200_000, "has 200000 characters"),
         ("a: " + "9" * 5000, "4300"),
+        ("a: 1\nb: 2\n'a': 3", "^'a' is given in line 1 and again in line 3$"),
+        ("x: [{y: 1, y: 2}]", "^'y' is given in line 1 and again in line 1$"),
     ],
 )
 def test_yaml_that_is_not_plain_is_refused(text: str, sentence: str) -> None:
@@ -78,3 +80,11 @@ def test_aliases_cannot_multiply_without_bound(line: str) -> None:
     with pytest.raises(ValueError, match="aliases stand for more than"):
         load_yaml("\n".join(lines))
     assert load_yaml("a: &a {x: 1}\nb: {<<: *a, y: 2}")["b"] == {"x": 1, "y": 2}
+
+
+def test_what_is_merged_may_be_given_again() -> None:
+    text = "a: &a {x: 1, y: 1}\nb: &b {<<: *a, x: 2}\nc: {<<: [*a, *b], y: 3}\nd: {<<: *a, <<: *b}"
+    found = load_yaml(text)
+    assert found["b"] == {"x": 2, "y": 1}
+    assert found["c"] == {"x": 1, "y": 3}
+    assert found["d"].keys() == {"x", "y"}

@@ -24,6 +24,7 @@ from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.ddpg.policies import HerPolicy
 from sb3_follow_object.ddpg.rnd import RndReward
 from sb3_follow_object.envs import make_vec
+from sb3_follow_object.envs.tasks import SUCCESS_DISTANCE
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.curriculum import Curriculum
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
@@ -32,6 +33,8 @@ from sb3_follow_object.object_stage.sldr import SldrReward
 from sb3_follow_object.replay.cher import GoalSelection
 from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
 from sb3_follow_object.runs.experiment import train
+from sb3_follow_object.settings import presets
+from sb3_follow_object.settings.docs_tables import with_tables
 from sb3_follow_object.settings.fields import Group, Setting, settings_of
 from sb3_follow_object.settings.learning import (
     AlgorithmSettings,
@@ -51,7 +54,7 @@ from sb3_follow_object.settings.stages import (
     CurriculumTestSettings,
     StageSettings,
 )
-from sb3_follow_object.settings.table import GROUPS, lines, with_tables
+from sb3_follow_object.settings.table import GROUPS, lines
 
 ROOT = Path(__file__).parents[2]
 TASK = "FollowObject/PushSideGap-v0"
@@ -192,7 +195,9 @@ def test_python_objects_are_told_before_a_run_begins(tmp_path: Path) -> None:
 
 def test_the_tables_in_the_docs_are_the_settings() -> None:
     text = (ROOT / "docs" / "runs.md").read_text()
-    assert with_tables(text) == text, "python -m sb3_follow_object.settings.table docs/runs.md"
+    assert with_tables(text) == text, (
+        "python -m sb3_follow_object.settings.docs_tables docs/runs.md"
+    )
 
 
 def test_the_command_names_every_setting_with_range_and_default() -> None:
@@ -297,3 +302,32 @@ def test_a_reward_has_its_own_settings_alone() -> None:
     assert AuxiliarySettings.of({"name": "rnd"}) is RndSettings
     with pytest.raises(ValueError, match=r"auxiliary \(sldr\) has no setting 'max_bonus'"):
         run_config(TASK, method="sldr", overrides={"auxiliary.max_bonus": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("given", "outcome"),
+    [
+        (0.04, 0.02),
+        (0, 0.0),
+        (None, "my.yml: replay_buffer_kwargs: moved_distance must be a number, not None"),
+        ("abc", "my.yml: replay_buffer_kwargs: moved_distance must be a number, not 'abc'"),
+        (True, "my.yml: replay_buffer_kwargs: moved_distance must be a number, not True"),
+        (-1, "my.yml: replay_buffer_kwargs: moved_distance is -1; it must lie in"),
+    ],
+)
+def test_distances_are_fitted_to_a_task_of_others_where_they_are_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: Any, outcome: Any
+) -> None:
+    monkeypatch.setattr(presets, "check_followable", lambda env_id: None)
+    monkeypatch.setattr(presets, "surface_choices", lambda env_id: (False,))
+    monkeypatch.setattr(presets, "success_distance_of", lambda env_id: SUCCESS_DISTANCE / 2)
+    entry = {"env_wrapper": presets.WRAPPER, "replay_buffer_kwargs": {"moved_distance": given}}
+    file = tmp_path / "my.yml"
+    file.write_text(json.dumps({"default": entry}))
+    try:
+        config = presets.run_config("FetchPush-v4", file=file)
+    except ValueError as error:
+        assert str(outcome) in str(error)
+    else:
+        kept = config.settings["algorithm"]["replay_buffer_kwargs"]["moved_distance"]
+        assert kept == outcome

@@ -1,0 +1,60 @@
+"""The tables of settings in the docs, with defaults and what the default preset has instead.
+
+`python -m sb3_follow_object.settings.docs_tables docs/runs.md` writes them anew.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from .presets import run_config
+from .run_config import flat
+from .table import GROUPS, default, listed, values
+
+BEGIN, END = "<!-- settings: written by", "<!-- settings: end -->\n"
+SHOWN = "FollowObject/PnPSimpleV2-v0"  # whose preset the tables show
+
+
+def markdown() -> str:
+    """Return the tables of the docs."""
+    parts, preset = [], _preset()
+    for group, prefix in GROUPS.items():
+        rows = [
+            f"| `{each.name}` | {values(each)} | {default(each)} "
+            f"| {preset.get(prefix + each.name, '')} | {each.sentence} |\n"
+            for each in listed(group)
+        ]
+        head = f"{group.title}:\n\n| name | values | default | `fo` | |\n|---|---|---|---|---|\n"
+        parts.append(head + "".join(rows))
+    return "\n".join(parts)
+
+
+def with_tables(text: str) -> str:
+    """Return a page with the tables between its marks written anew."""
+    before, mark, rest = text.partition(BEGIN)
+    if not mark or END not in rest:
+        raise ValueError(f"there are no marks {BEGIN} ... {END.strip()}")
+    comment = rest[: rest.index("\n") + 1]
+    return f"{before}{mark}{comment}\n{markdown()}\n{END}{rest.partition(END)[2]}"
+
+
+def _preset() -> dict[str, str]:
+    """Return what the default preset of FO sets otherwise than the classes do, by dotted names."""
+    config = run_config(SHOWN)
+    said = {name.removeprefix("algorithm."): value for name, value in flat(config.settings).items()}
+    said |= {"n_timesteps": config.total_timesteps}
+    said |= {name: getattr(config, name) for name in ("eval_every", "solved_at")}
+    defaults = {
+        f"{prefix}{each.name}": default(each)
+        for group, prefix in GROUPS.items()
+        for each in listed(group)
+    }
+    words = {name: json.dumps(value).strip('"') for name, value in said.items()}
+    return {name: word for name, word in words.items() if defaults.get(name) != word}
+
+
+if __name__ == "__main__":
+    for file in map(Path, sys.argv[1:]):
+        file.write_text(with_tables(file.read_text()))
