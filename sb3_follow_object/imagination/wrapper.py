@@ -55,7 +55,7 @@ class ImaginedGoalWrapper(
         env: environment with Dict goal observations. Where gymnasium made it, what it lacks of
             ``RobotTask`` is added: judging many goals at once, success, rewards of -1 and 0.
         predictor: F_phi; or the folder it was saved in; or "auto", the one that ``get_predictor``
-            keeps for this task, loaded (or learned) when it is first needed.
+            keeps for this task. The last two are loaded when first needed.
         curriculum: its k_max is read at each reset; or keyword arguments of ``Curriculum`` besides
             the horizon.
 
@@ -65,9 +65,8 @@ class ImaginedGoalWrapper(
             CurriculumCallback makes for its tests.
 
     Raises:
-        ValueError: the environment has no 3-D goals, rewards or success for any goal, the folder
-            holds no predictor of its task, the predictor and the curriculum have different
-            horizons, or a setting is wrong.
+        ValueError: the environment has no 3-D goals, rewards or success for any goal, the
+            predictor and the curriculum have different horizons, or a setting is wrong.
     """
 
     def __init__(
@@ -86,7 +85,9 @@ class ImaginedGoalWrapper(
         self.curriculum = (
             curriculum if isinstance(curriculum, Curriculum) else _curriculum(env, curriculum)
         )
-        self._predictor = predictor if predictor == AUTO else self._checked(predictor)
+        self._predictor = predictor
+        if isinstance(predictor, GoalPredictor):
+            check_horizons(predictor, self.curriculum)
         self._rng = np.random.default_rng()
         self._shown = self._original = np.zeros(self._space.size, self._dtype)
         self._level = 0
@@ -97,14 +98,9 @@ class ImaginedGoalWrapper(
     def predictor(self) -> GoalPredictor:
         """F_phi, loaded (or, with "auto", learned) when it is first asked for."""
         if not isinstance(self._predictor, GoalPredictor):
-            self._predictor = self._checked(self._predictor)
+            self._predictor = _find_predictor(self._predictor, self.env)
+            check_horizons(self._predictor, self.curriculum)
         return self._predictor
-
-    def _checked(self, predictor: GoalPredictor | str | os.PathLike[str]) -> GoalPredictor:
-        if not isinstance(predictor, GoalPredictor):
-            predictor = _find_predictor(predictor, self.env)
-        check_horizons(predictor, self.curriculum)
-        return predictor
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

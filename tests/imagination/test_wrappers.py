@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -202,11 +201,6 @@ def test_the_gymnasium_wrapper_shows_goals_in_the_same_way() -> None:
 
 def test_the_gymnasium_wrapper_is_a_valid_environment() -> None:
     check_env(single(toy.curriculum()), skip_render_check=True)
-
-
-def test_a_folder_without_a_predictor_is_refused_at_once(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="nope"):
-        ImaginedGoalWrapper(gym.make("FollowObject/PnPShelf-v0"), tmp_path / "nope")
 
 
 def test_the_gymnasium_wrapper_follows_its_seed() -> None:
