@@ -3,7 +3,7 @@
 METHODS = ("fo", "her", "shaped", "rnd", "sldr", "cher", "fo-sldr", "rher")
 WITHOUT_PAPER = ("rher",)  # the paper has no such rival, so there is no preset of its settings
 # Stock algorithms, which have no presets here, and the files that rl_zoo3 trains them with.
-STOCK = {"ddpg": "ddpg.yml", "td3": "ddpg.yml", "sac": "sac.yml", "tqc": "sac.yml"}
+STOCK = {"ddpg": "ddpg.yml", "td3": "ddpg.yml", "sac": "sac.yml", "tqc": "tqc.yml"}
 
 
 def who_trains(name: str) -> str:

@@ -138,10 +138,10 @@ def test_her_ddpg_trains_and_plays(method: str, n_envs: int, cache: Path, folder
         assert "Success rate:" in play(stock=False, fresh=fresh)
 
 
-@pytest.mark.parametrize(("algorithm", "file"), [("td3", "ddpg.yml"), ("sac", "sac.yml")])
-def test_a_file_serves_two_stock_algorithms(
-    algorithm: str, file: str, cache: Path, folder: Path
-) -> None:
+@pytest.mark.parametrize(
+    ("algorithm", "file"), [("td3", "ddpg.yml"), ("sac", "sac.yml"), ("tqc", "tqc.yml")]
+)
+def test_files_serve_stock_algorithms(algorithm: str, file: str, cache: Path, folder: Path) -> None:
     stock = ["--algo", algorithm, *STOCK]
     conf = ["--conf-file", str(CONFIGS / file)]
     out = train(cache, *stock, *conf, stock=True, n_envs=2, steps=one_test(file, 2))
@@ -151,7 +151,7 @@ def test_a_file_serves_two_stock_algorithms(
     assert "Success rate:" in play(*stock, stock=True)
 
 
-@pytest.mark.parametrize("file", ["ddpg.yml", "sac.yml"])
+@pytest.mark.parametrize("file", ["ddpg.yml", "sac.yml", "tqc.yml"])
 def test_stock_files_say_what_the_preset_says(file: str) -> None:
     stock = yaml.safe_load((CONFIGS / file).read_text())
     own = yaml.safe_load((CONFIGS / "fo.yml").read_text())
@@ -175,7 +175,15 @@ def test_rl_zoo3_and_train_read_the_same_of_gymnasium_robotics_tasks(env_id: str
         assert entry[name] == algorithm[name], name
 
 
-@pytest.mark.parametrize("file", ["ddpg.yml", "sac.yml"])
+def test_of_sac_and_tqc_sac_alone_has_one_critic() -> None:
+    sac, tqc = (yaml.safe_load((CONFIGS / file).read_text()) for file in ("sac.yml", "tqc.yml"))
+    assert set(sac) == set(tqc)
+    for name, entry in sac.items():
+        kwargs = entry["policy_kwargs"].replace(" n_critics=1,", "")
+        assert {**entry, "policy_kwargs": kwargs} == tqc[name]
+
+
+@pytest.mark.parametrize("file", ["ddpg.yml", "sac.yml", "tqc.yml"])
 def test_stock_files_have_every_task_with_its_horizon(file: str) -> None:
     entries = yaml.safe_load((CONFIGS / file).read_text())
     for name, task in TASKS.items():
