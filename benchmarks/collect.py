@@ -323,7 +323,8 @@ def draw(rows: list[Row]) -> None:
     ran = {row["method"] for row in rows if row["task"] in TASKS}
     draw_results(RESULTS, RESULTS / "figures", [method for method in METHODS if method in ran])
     if len(ran & {*COMPARED}) > 1:
-        draw_methods(RESULTS, RESULTS / "figures" / "reaching.png", COMPARED)
+        compared = [method for method in METHODS if method in COMPARED]  # colours as elsewhere
+        draw_methods(RESULTS, RESULTS / "figures" / "reaching.png", compared)
     for task, name in FEATURED.items():
         wanted = [row for row in rows if row["task"] == task and row["method"] in COMPARED]
         draw_curves([folder_of(row) for row in wanted], RESULTS / name)
