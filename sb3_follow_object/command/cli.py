@@ -73,7 +73,9 @@ def _sentence(error: Exception) -> str:
         from ..envs.goal_envs import SAY_GOALS
 
         if said.endswith(SAY_GOALS):  # which Python alone can
-            said += ", as arguments of RobotTask in a module of your own (docs/own_task.md)"
+            said += (
+                ", as arguments of RobotTask in a module of your own (docs/tutorials/own_robot.md)"
+            )
     return said
 
 
