@@ -21,6 +21,7 @@ import gymnasium as gym
 
 import sb3_follow_object.envs  # noqa: F401  (registers the ids)
 from sb3_follow_object.settings.presets import run_config
+from sb3_follow_object.settings.run_config import flat
 
 OUT = Path(__file__).with_name("ablations.csv")
 # What does not change what is learned, or is a column of its own.
@@ -28,21 +29,10 @@ LIMITS = {"total_timesteps", "settings.n_threads", "seed", "checkpoint_minutes"}
 LIMITS |= {"keep_checkpoints", "keep_last_checkpoint", "torch_threads"}
 
 
-def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested settings by their dotted names."""
-    leaves: dict[str, Any] = {}
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            leaves |= flat(value, f"{prefix}{name}.")
-        else:
-            leaves[f"{prefix}{name}"] = list(value) if isinstance(value, tuple) else value
-    return leaves
-
-
 def difference(config: dict[str, Any]) -> str:
     """Say what a run's settings change in the default preset of its method."""
     default = run_config(config["env_id"], method=config["method"], seed=config["seed"])
-    ours, theirs = flat(config), flat(asdict(default))
+    ours, theirs = flat(config), flat(json.loads(json.dumps(asdict(default))))
     changed = [
         f"{name.removeprefix('settings.').removeprefix('algorithm.')}={ours.get(name, 'unset')}"
         for name in sorted({*ours, *theirs} - LIMITS)
