@@ -11,7 +11,7 @@ from pathlib import Path
 
 from .presets import run_config
 from .run_config import flat
-from .table import GROUPS, default, listed, values
+from .table import GROUPS, by_name, default, listed, values
 
 BEGIN, END = "<!-- settings: written by", "<!-- settings: end -->\n"
 SHOWN = "FollowObject/PnPSimpleV2-v0"  # whose preset the tables show
@@ -46,11 +46,7 @@ def _preset() -> dict[str, str]:
     said = {name.removeprefix("algorithm."): value for name, value in flat(config.settings).items()}
     said |= {"n_timesteps": config.total_timesteps}
     said |= {name: getattr(config, name) for name in ("eval_every", "solved_at")}
-    defaults = {
-        f"{prefix}{each.name}": default(each)
-        for group, prefix in GROUPS.items()
-        for each in listed(group)
-    }
+    defaults = {name: default(each) for name, each in by_name().items()}
     words = {name: json.dumps(value).strip('"') for name, value in said.items()}
     return {name: word for name, word in words.items() if defaults.get(name) != word}
 

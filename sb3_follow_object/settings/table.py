@@ -72,7 +72,7 @@ def lines(name: str | None = None) -> list[str]:
     Raises:
         ValueError: there is none of that name, with the nearest that there is.
     """
-    found = _dotted()
+    found = by_name()
     wanted = found if name is None else _below(found, name)
     if not wanted:
         meant = _nested(str(name)) or did_you_mean(str(name), found)
@@ -90,7 +90,7 @@ def check_dotted(names: Iterable[str], where: str) -> None:
         names: that stand for themselves, without their group's.
         where: beginning of the sentence.
     """
-    known = _dotted()
+    known = by_name()
     for name in names:
         if name not in known and (meant := _nested(name)):
             raise ValueError(f"{where} has no setting {name!r}{meant}")
@@ -98,12 +98,12 @@ def check_dotted(names: Iterable[str], where: str) -> None:
 
 def _nested(name: str) -> str:
     """The end of a sentence about a name that only settings of groups have; "" where none has."""
-    meant = [repr(dotted) for dotted in _dotted() if dotted.endswith(f".{name}")]
+    meant = [repr(dotted) for dotted in by_name() if dotted.endswith(f".{name}")]
     return f"; did you mean {' or '.join(meant)}?" if meant else ""
 
 
-def _dotted() -> dict[str, Setting]:
-    """Return every setting by its dotted name."""
+def by_name() -> dict[str, Setting]:
+    """Return every setting by its dotted name, as --set takes it."""
     return {
         f"{prefix}{each.name}": each for group, prefix in GROUPS.items() for each in listed(group)
     }
