@@ -44,6 +44,7 @@ def _preset() -> dict[str, str]:
     """Return what the default preset of FO sets otherwise than the classes do, by dotted names."""
     config = run_config(SHOWN)
     said = {name.removeprefix("algorithm."): value for name, value in flat(config.settings).items()}
+    said |= {name: value for name, value in config.settings.items() if value == {}}
     said |= {"n_timesteps": config.total_timesteps}
     said |= {name: getattr(config, name) for name in ("eval_every", "solved_at")}
     defaults = {name: default(each) for name, each in by_name().items()}
