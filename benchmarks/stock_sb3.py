@@ -4,8 +4,9 @@
         --conf-file zoo_configs/ddpg.yml --steps 300000 --run runs/PnPShelf-sb3-ddpg-0
 
 RUN then holds rl_zoo3's logs, the validations on original goals as evaluations.csv, and result.json
-with the final test of 380 episodes. The object's stage is learned anew and counted. A row of
-benchmarks/results is made of it by collect.py.
+with the final test of 380 episodes. The object's stage is learned anew and counted. With --minutes
+rl_zoo3 is interrupted then, as by Ctrl+C, and what it saves is tested. A row of benchmarks/results
+is made of it by collect.py.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -51,9 +53,18 @@ def zoo_command(options: argparse.Namespace) -> list[str]:
 def train(options: argparse.Namespace) -> float:
     """Run rl_zoo3 and return the seconds that it took."""
     env = {**os.environ, CACHE_VARIABLE: str(options.run / "cache")}
+    # A shell's background jobs ignore SIGINT, and would hand that on.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     began = time.monotonic()
     with open(options.run / "train.log", "w") as log:
-        subprocess.run(zoo_command(options), check=True, env=env, stdout=log, stderr=log)
+        zoo = subprocess.Popen(zoo_command(options), env=env, stdout=log, stderr=log)
+        try:
+            failed = zoo.wait(options.minutes and 60 * options.minutes)
+        except subprocess.TimeoutExpired:
+            zoo.send_signal(signal.SIGINT)
+            failed = zoo.wait()
+    if failed:
+        raise SystemExit(f"rl_zoo3 failed: see {options.run / 'train.log'}")
     return time.monotonic() - began
 
 
@@ -83,6 +94,8 @@ def final_test(folder: Path, options: argparse.Namespace) -> tuple[Episodes, Bas
 
 def validations(folder: Path, before: int) -> list[tuple[int, float]]:
     """Return rl_zoo3's evaluations: env steps, those of the object included, and success."""
+    if not (folder / "evaluations.npz").exists():
+        return []  # interrupted before the first
     with np.load(folder / "evaluations.npz") as file:
         steps, success = file["timesteps"], file["successes"].mean(axis=1)
     return [(int(n) + before, float(rate)) for n, rate in zip(steps, success, strict=True)]
@@ -117,6 +130,7 @@ def main() -> None:
     parser.add_argument("--env", required=True)
     parser.add_argument("--conf-file", required=True)
     parser.add_argument("--steps", type=int, required=True, help="of the robot and its tests")
+    parser.add_argument("--minutes", type=float, help="stop after so many, if steps are left")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1, help="of PyTorch")
     parser.add_argument("--method", help="in the table; sb3-ALGO by default")
