@@ -95,7 +95,7 @@ def final_test(folder: Path, options: argparse.Namespace) -> tuple[Episodes, Bas
 def validations(folder: Path, before: int) -> list[tuple[int, float]]:
     """Return rl_zoo3's evaluations: env steps, those of the object included, and success."""
     if not (folder / "evaluations.npz").exists():
-        return []  # interrupted before the first
+        return []
     with np.load(folder / "evaluations.npz") as file:
         steps, success = file["timesteps"], file["successes"].mean(axis=1)
     return [(int(n) + before, float(rate)) for n, rate in zip(steps, success, strict=True)]
@@ -105,11 +105,14 @@ def result(options: argparse.Namespace, seconds: float) -> dict[str, Any]:
     """Return what result.json holds, after writing the validations."""
     (folder,) = (options.run / "logs" / options.algo).iterdir()
     before = last_told(options.run, r"^ +(\d+) env steps")
+    episodes, model = final_test(folder, options)
+    rows = [(n, rate, EVAL_EPISODES) for n, rate in validations(folder, before)]
+    if not rows:  # interrupted before the first
+        rows = [(model.num_timesteps + before, episodes.success_rate, TEST_EPISODES)]
     with open(options.run / "evaluations.csv", "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("env_steps", "success_rate", "episodes"))
-        writer.writerows((n, rate, EVAL_EPISODES) for n, rate in validations(folder, before))
-    episodes, model = final_test(folder, options)
+        writer.writerows(rows)
     return {
         "task": options.env.removeprefix("FollowObject/").removesuffix("-v0"),
         "method": options.method or f"sb3-{options.algo}",
