@@ -49,7 +49,7 @@ PARTS: list[tuple[str, type, str]] = [
     (UPDATES_OF_ROBOT, HerDDPG, "train"),
     ("tests of the curriculum", CurriculumCallback, "_test"),
     ("validations", OriginalGoalEvalCallback, "_on_rollout_end"),
-    ("checkpoints", CheckpointCallback, "_write"),
+    ("checkpoints", CheckpointCallback, "write"),
 ]
 WHOLE = ("tests of the curriculum", "validations", OBJECT[0])  # with the physics in them
 

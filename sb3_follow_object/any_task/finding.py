@@ -63,7 +63,6 @@ class Observed:
         later: the same, (n, nbody, 12), once bodies are where the joints say: after a step MuJoCo
             has them where they were before its last one.
         sites: positions of sites, (n, nsite, 3) metres.
-        terminated: whether an episode ended before its time.
         model: the last reset's.
     """
 
@@ -74,7 +73,6 @@ class Observed:
     rotations: np.ndarray
     later: np.ndarray
     sites: np.ndarray
-    terminated: bool
     model: mujoco.MjModel
 
 
@@ -93,7 +91,6 @@ def observe(env: gym.Env, n_resets: int = N_RESETS, n_steps: int = N_STEPS) -> O
     """
     env.action_space.seed(0)
     rows: list[tuple[np.ndarray, ...]] = []
-    terminated = False
 
     def keep(obs: dict[str, np.ndarray]) -> None:
         model, data = physics_of(env)
@@ -110,7 +107,6 @@ def observe(env: gym.Env, n_resets: int = N_RESETS, n_steps: int = N_STEPS) -> O
     for _ in range(n_steps):
         obs, _, ended, truncated, _ = env.step(env.action_space.sample())
         keep(obs)
-        terminated |= bool(ended)
         if ended or truncated:
             obs, _ = env.reset()
     for root in _passive_roots(physics_of(env)[0]):
@@ -120,7 +116,7 @@ def observe(env: gym.Env, n_resets: int = N_RESETS, n_steps: int = N_STEPS) -> O
     columns = [np.stack(column) for column in zip(*rows, strict=True)]
     achieved, desired, told, positions, rotations, later, sites = columns
     model = physics_of(env)[0]
-    return Observed(achieved, desired, told, positions, rotations, later, sites, terminated, model)
+    return Observed(achieved, desired, told, positions, rotations, later, sites, model)
 
 
 def candidates(seen: Observed) -> list[Candidate]:

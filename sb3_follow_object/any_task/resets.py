@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
@@ -66,15 +65,12 @@ class Resets:
             raise ValueError(f"{path} holds no recorded resets") from error
 
 
-def record_resets(
-    env: gym.Env, n: int, begun: Callable[[int], None] = lambda done: None
-) -> tuple[Resets, mujoco.MjModel, mujoco.MjData]:
+def record_resets(env: gym.Env, n: int) -> tuple[Resets, mujoco.MjModel, mujoco.MjData]:
     """Reset an environment n times and keep where each episode begins.
 
     Args:
         env: with Dict goal observations; reset i has the seed i.
         n: at least 1.
-        begun: called after each reset with their number so far.
 
     Returns:
         The resets, and a copy of the first one's model and data.
@@ -101,7 +97,6 @@ def record_resets(
                 np.concatenate([data.xpos, data.xquat], axis=1),
             )
         )
-        begun(seed + 1)
     assert first is not None
     return Resets(*(np.stack(column) for column in zip(*rows, strict=True))), *first
 

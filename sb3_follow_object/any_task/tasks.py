@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..common.reports import Report
 from ..envs import IDS, make_vec, object_id, physics_id
 from ..envs.goal_envs import missing_goal_keys
 from ..envs.registration import import_task, registration_key
@@ -24,15 +23,10 @@ SURFACE_STEPS = 120_000  # env steps after which an object left on its surface m
 _LEAST_TO_REACH = 25  # env steps
 
 
-def check_followable(env_id: str, report: Report = lambda sentence: None) -> None:
-    """Raise a ValueError with the reason if a task's object cannot be followed.
-
-    Args:
-        env_id: gymnasium id.
-        report: told where that takes long.
-    """
+def check_followable(env_id: str) -> None:
+    """Raise a ValueError with the reason if a task's object cannot be followed."""
     if env_id not in IDS:
-        derived(env_id, report)
+        derived(env_id)
 
 
 def what_is_followed(env_id: str) -> str:

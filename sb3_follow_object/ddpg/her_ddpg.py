@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -33,8 +33,6 @@ from .input_moments import InputMoments
 from .kept_state import KeptDDPG
 from .policies import HerPolicy, NormalizedGoalExtractor
 from .updates import COLUMNS, Updates
-
-SelfHerDDPG = TypeVar("SelfHerDDPG", bound="HerDDPG")
 
 # Transitions drawn from the buffer in one call: enough to spread the fixed cost, small in memory.
 _SAMPLE_CHUNK = 32_768
@@ -121,7 +119,7 @@ class HerDDPG(KeptDDPG):
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = AlgorithmSettings.optimize_memory_usage,
+        optimize_memory_usage: bool = False,
         noise_std: float = AlgorithmSettings.noise_std,
         random_action_prob: float = AlgorithmSettings.random_action_prob,
         action_l2: float = AlgorithmSettings.action_l2,
@@ -141,6 +139,8 @@ class HerDDPG(KeptDDPG):
         device: th.device | str = AlgorithmSettings.device,
         _init_setup_model: bool = True,
     ):
+        if optimize_memory_usage:
+            raise ValueError("hindsight replay cannot have optimize_memory_usage; leave it out")
         own_policy = policy in ("MultiInputPolicy", HerPolicy)
         own_buffer = replay_buffer_class in (None, FollowObjectReplayBuffer)
         settings = AlgorithmSettings(
@@ -153,7 +153,6 @@ class HerDDPG(KeptDDPG):
             gamma=gamma,
             train_freq=train_freq,
             gradient_steps=gradient_steps,
-            optimize_memory_usage=optimize_memory_usage,
             noise_std=noise_std,
             random_action_prob=random_action_prob,
             action_l2=action_l2,
@@ -188,7 +187,6 @@ class HerDDPG(KeptDDPG):
             replay_buffer_kwargs=(
                 settings.replay_buffer_kwargs if own_buffer else replay_buffer_kwargs
             ),
-            optimize_memory_usage=settings.optimize_memory_usage,
             tensorboard_log=settings.tensorboard_log,
             # DDPG writes into it
             policy_kwargs=dict((settings.policy_kwargs if own_policy else policy_kwargs) or {}),

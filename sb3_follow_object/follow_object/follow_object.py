@@ -27,9 +27,9 @@ from ..object_stage.networks import FILE as OBJECT_FILE
 from ..object_stage.networks import ObjectNetworks
 from ..object_stage.sldr import reads_object_networks
 from ..object_stage.stage import ObjectStage
-from ..settings.fields import check_names
+from ..settings.fields import check_names, settings_of
 from ..settings.presets import run_config
-from ..settings.run_config import check_plain
+from ..settings.run_config import RunConfig, check_plain
 from ..settings.stages import StageSettings
 from .checks import check_algorithms, checked_settings, on_table_for, reach_in
 from .robot_stage import RobotStage
@@ -43,7 +43,8 @@ class FollowObject:
 
     `learn()` runs the three stages of the paper (section 4): the object alone learns to reach the
     goal; its paths train F_phi; the robot trains on original goals and on the goals that F_phi
-    imagines at growing distance.
+    imagines at growing distance. Its defaults are the plain method's; `from_preset` takes what was
+    measured to be best, reaching first among it, and is what to begin with.
 
     Args:
         env_id: a task of this package, e.g. "FollowObject/PnPShelf-v0", or any goal environment on
@@ -209,14 +210,15 @@ class FollowObject:
             method: one of `METHODS`.
             preset: "default", what was measured to be best, or "paper", the authors' settings.
             seed: decides the whole run.
-            overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win. Those
-                of a run folder (n_timesteps, eval_every and the like) mean nothing here.
+            overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win.
             **arguments: of the class, which are no settings: predictor, object_networks, report,
                 make_env, object, goal, is_success, effector, lift.
 
         Raises:
-            ValueError: an id, a key or a value that cannot be meant, with the nearest that can.
+            ValueError: an id, a key or a value that cannot be meant, with the nearest that can; or
+                a setting among the arguments, or one of a run folder, such as n_timesteps.
         """
+        _check_places(arguments, overrides or {})
         own = [name for name in _OF_AN_ENVIRONMENT if name in arguments]
         given = {name: arguments.pop(name) for name in own}
         env_id = registered(env_id, **given)
@@ -432,6 +434,19 @@ class FollowObject:
     def close(self) -> None:
         """Close all environments."""
         self.robot_stage.close()
+
+
+def _check_places(arguments: Mapping[str, Any], overrides: Mapping[str, Any]) -> None:
+    """Raise a ValueError for what `from_preset` takes elsewhere or not at all.
+
+    Args:
+        arguments: those of the class.
+        overrides: settings by their dotted names.
+    """
+    for name in settings_of(StageSettings).keys() & arguments.keys():
+        raise ValueError(f"{name} is a setting: give overrides={{{name!r}: ...}}")
+    for name in settings_of(RunConfig).keys() & overrides.keys():
+        raise ValueError(f"{name} is of a run folder, which train() makes; learn() takes env steps")
 
 
 def _say_nothing(sentence: str) -> None:

@@ -46,6 +46,8 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
     ``terminal_observation`` carries the shown goal too. Put VecMonitor outside, so that returns
     are those of the shown goals.
 
+    It imagines from its first reset, as ``ImaginedGoalWrapper`` does that is given a Curriculum.
+
     Args:
         venv: vectorised environment with Dict goal observations; ``compute_reward`` and the
             success method of its first copy must accept batches of goals.
@@ -55,7 +57,8 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
             level k_max, in every episode.
 
     Raises:
-        ValueError: as ``ImaginedGoalWrapper``, or an unknown mode.
+        ValueError: as ``ImaginedGoalWrapper``, an unknown mode, or what is no GoalPredictor or
+            Curriculum.
     """
 
     def __init__(
@@ -71,6 +74,11 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
             raise ValueError(
                 "ImaginedGoalVecEnv needs goals in metres: put it inside VecNormalize, not around "
                 "it"
+            )
+        if not isinstance(predictor, GoalPredictor) or not isinstance(curriculum, Curriculum):
+            raise ValueError(
+                "ImaginedGoalVecEnv takes a GoalPredictor (get_predictor makes one) and a "
+                f"Curriculum, not {type(predictor).__name__} and {type(curriculum).__name__}"
             )
         super().__init__(venv)
         self._space, self._dtype = checked_goals(venv.observation_space, venv.has_attr)

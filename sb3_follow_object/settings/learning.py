@@ -186,10 +186,6 @@ class PolicySettings(Group):
     n_critics: Annotated[
         Whole, setting("critics, whose lowest value counts", ge=1, le=CRITICS_LIMIT)
     ] = 1
-    share_features_extractor: Annotated[
-        Flag, setting("whether actor and critic share what reads the inputs")
-    ] = False
-    normalize_images: Annotated[Flag, setting("whether images are divided by 255")] = True
     optimizer_kwargs: Annotated[
         dict[str, Any] | None, setting("of the optimiser", none="fused", group=Anything)
     ] = None
@@ -238,9 +234,6 @@ class AlgorithmSettings(Group):
         TrainFreq, setting("steps, or episodes, of every environment between updates")
     ] = (1, "episode")
     gradient_steps: Annotated[GradientSteps, setting("updates in turn")] = 40
-    optimize_memory_usage: Annotated[Flag, setting("SB3's; hindsight replay cannot have it")] = (
-        False
-    )
     noise_std: Annotated[
         Number, setting("of the Gaussian noise on each action in [-1, 1]", ge=0)
     ] = 0.2

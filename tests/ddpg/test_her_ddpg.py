@@ -334,6 +334,7 @@ def test_environment_without_goals_is_refused() -> None:
         ({"target_clip": "wide"}, "target_clip must be .*, not 'wide'"),
         ({"target_clip": [0.0, -1.0]}, "target_clip must be .low, high."),
         ({"target_clip": [0.0]}, "target_clip must be .low, high."),
+        ({"optimize_memory_usage": True}, "cannot have optimize_memory_usage"),
         ({"gamma": 1.0}, "gamma is 1.0; it must lie in"),
         ({"tau": 2.0}, "tau is 2.0; it must lie in"),
         ({"batch_size": 0}, "batch_size is 0; it must be at least 1"),

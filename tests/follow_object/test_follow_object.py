@@ -283,6 +283,18 @@ def test_preset_refuses_what_train_refuses() -> None:
         FollowObject.from_preset(ENV, overrides={"batchsize": 3})
 
 
+@pytest.mark.parametrize("name", ["n_envs", "imagine"])
+def test_preset_takes_settings_as_overrides_alone(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} is a setting: give overrides"):
+        FollowObject.from_preset(ENV, **{name: 1})
+
+
+@pytest.mark.parametrize("name", ["n_timesteps", "solved_at"])
+def test_preset_refuses_what_only_a_run_folder_has(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} is of a run folder"):
+        FollowObject.from_preset(ENV, overrides={name: 1})
+
+
 @pytest.mark.parametrize("steps", [300_000.0, -1, "many"])
 def test_wrong_steps_are_refused_before_the_object_learns(
     steps: Any, monkeypatch: pytest.MonkeyPatch

@@ -45,6 +45,17 @@ def test_goals_in_standard_deviations_are_refused(training: bool) -> None:
         ImaginedGoalVecEnv(normalised, toy.StraightPredictor(), toy.curriculum())
 
 
+@pytest.mark.parametrize(
+    ("predictor", "curriculum", "named"),
+    [("auto", toy.curriculum(), "str and Curriculum"), (toy.StraightPredictor(), {}, "and dict")],
+)
+def test_copies_want_a_predictor_and_a_curriculum(
+    predictor: Any, curriculum: Any, named: str
+) -> None:
+    with pytest.raises(ValueError, match=f"takes a GoalPredictor .* and a Curriculum, not .*{named}"):
+        ImaginedGoalVecEnv(DummyVecEnv([toy.PointEnv]), predictor, curriculum)
+
+
 def test_original_goals_come_from_the_environment() -> None:
     finished = episodes(imagining(toy.curriculum()), 50)
     bare = DummyVecEnv([toy.PointEnv] * N)
