@@ -52,7 +52,7 @@ def test_goals_in_standard_deviations_are_refused(training: bool) -> None:
 def test_copies_want_a_predictor_and_a_curriculum(
     predictor: Any, curriculum: Any, named: str
 ) -> None:
-    with pytest.raises(ValueError, match=f"takes a GoalPredictor .* and a Curriculum, not .*{named}"):
+    with pytest.raises(ValueError, match=f"takes a GoalPredictor .* and a Curriculum.*{named}"):
         ImaginedGoalVecEnv(DummyVecEnv([toy.PointEnv]), predictor, curriculum)
 
 
