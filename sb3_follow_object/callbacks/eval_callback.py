@@ -194,7 +194,7 @@ class OriginalGoalEvalCallback(CopyableCallback):
         """Return the file's rows up to the state that training starts from."""
         if not path.exists():
             return []
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
             rows = list(reader)
         if tuple(reader.fieldnames or ()) != self.COLUMNS:

@@ -12,7 +12,7 @@ def open_streams() -> None:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # else the first file that is opened would get its number, and its lines
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 for good
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 for good
         elif hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
 

@@ -80,7 +80,7 @@ def lock(folder: str | os.PathLike[str], *, wait: bool) -> Iterator[None]:
     except ImportError:
         yield
         return
-    with open(Path(folder) / LOCK, "a") as file:
+    with open(Path(folder) / LOCK, "a", encoding="utf-8") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:

@@ -61,7 +61,7 @@ class LocalExecutor(NoCopies):
         log.parent.mkdir(parents=True, exist_ok=True)
         # Read by the libraries as they are imported, so the process must begin with it.
         threads = {name: str(job.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
-        with open(log, "a") as file:
+        with open(log, "a", encoding="utf-8") as file:
             child = subprocess.Popen(
                 [sys.executable, "-m", "sb3_follow_object.comparison.worker"],
                 stdin=subprocess.PIPE,
@@ -128,10 +128,10 @@ class LocalExecutor(NoCopies):
         """Return one line about a process that could not say why it ended."""
         how = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
         try:
-            lines = [line.strip() for line in self._log(name).read_text().splitlines()]
-        except (OSError, UnicodeDecodeError):
+            lines = self._log(name).read_text("utf-8", "replace").splitlines()
+        except OSError:
             lines = []
-        lines = [line for line in lines if line]
+        lines = [line.strip() for line in lines if line.strip()]
         return f"{how}; the log's last line: {lines[-1]}" if lines else how
 
     def _log(self, name: str) -> Path:

@@ -60,7 +60,7 @@ def write(folder: Path, saved: Saved) -> None:
 
 def saved_id(folder: Path) -> str:
     """Return the id of the environment that a save is of; raises as `read`."""
-    return str(json.loads((folder / _SETTINGS).read_text())["env_id"])
+    return str(json.loads((folder / _SETTINGS).read_text("utf-8"))["env_id"])
 
 
 def read(folder: Path) -> Saved:
@@ -70,7 +70,7 @@ def read(folder: Path) -> Saved:
         OSError, KeyError, RecursionError, TypeError, ValueError: it holds no save, or a damaged
             one.
     """
-    settings = json.loads((folder / _SETTINGS).read_text())
+    settings = json.loads((folder / _SETTINGS).read_text("utf-8"))
     env_id = known_id(settings["env_id"])
     predictor = networks = None
     if (folder / _PREDICTOR).exists():

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..common.array_trees import Camera, Snapshot, load_tree
 from ..common.copies import NoCopies
-from ..common.reports import Report, Trouble
+from ..common.reports import Report, Trouble, reason
 
 CHECKPOINTS = "checkpoint-*.safetensors"
 
@@ -108,12 +108,12 @@ class Checkpoints(NoCopies):
                 f"checkpoint at {env_steps} env steps: {size / 1e6:.1f} MB, "
                 f"training stood still for {stalled:.2f} s"
             )
-        except OSError as error:
+        except Exception as error:  # nobody else would hear of it
             kept = checkpoint_files(self.folder)
             rest = f"the last good one is {kept[-1].name}" if kept else "there is no other so far"
             self._outcome = Trouble(
                 f"the checkpoint at {env_steps} env steps could not be written "
-                f"({error.strerror or error}); {rest}"
+                f"({reason(error)}); {rest}"
             )
 
     def _drop_old(self, newest: Path) -> None:

@@ -157,7 +157,7 @@ def _card(run: Path, config: RunConfig, results: dict[str, Any]) -> str:
             }
         ],
     }
-    made = json.loads((run / RESULT).read_text()) if (run / RESULT).exists() else {}
+    made = json.loads((run / RESULT).read_text("utf-8")) if (run / RESULT).exists() else {}
     steps = made.get("env_steps")
     text = _TEXT.format(
         method=config.method,

@@ -70,7 +70,7 @@ def load_object_stage(folder: Path, run: FollowObject, saved: Any) -> float | No
         physics = physics_of_task(run.env_id)
         stage.networks = ObjectNetworks.load(folder / OBJECT_FILE, run.env_id, physics)
     try:
-        facts = json.loads(path.read_text())
+        facts = json.loads(path.read_text("utf-8"))
         # A stage that other runs share may have more than this one uses.
         stage.steps = int(facts["object_steps" if run.imagine else "policy_steps"])
         stage.success = float(facts["object_success"])

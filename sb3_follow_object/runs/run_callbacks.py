@@ -134,6 +134,11 @@ class RunCallback(BaseCallback):
         self._n_solved = 0  # validations in a row
         self._n_validated = 0
 
+    @property
+    def solved(self) -> bool:
+        """Whether enough validations in a row have gone well enough."""
+        return self.solved_at > 0 and self._n_solved >= self.solved_validations
+
     def _on_step(self) -> bool:
         return True
 
@@ -159,7 +164,7 @@ class RunCallback(BaseCallback):
                 "success_rate": self.evaluation.success_rate,
             }
         )
-        if self.solved_at and self._n_solved >= self.solved_validations:
+        if self.solved:
             raise Solved
 
     def state_dict(self) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def check_same_run(folder: Path, config: RunConfig) -> None:
     if not path.exists():
         raise ValueError(f"{folder} holds no run to resume")
     try:
-        kept = RunConfig(**json.loads(path.read_text()))
+        kept = RunConfig(**json.loads(path.read_text("utf-8")))
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not the configuration of a run ({error})") from error
     same_steps = replace(kept, total_timesteps=config.total_timesteps)
@@ -54,7 +54,8 @@ def check_same_run(folder: Path, config: RunConfig) -> None:
         name, ours, theirs = different
         raise ValueError(
             f"the run in {folder} has {name} {ours!r}, not {theirs!r}; "
-            "resume it as it is or start another in another folder"
+            "resume it with all its settings, on the command line by no flag at all, or start "
+            "another in another folder"
         )
 
 
@@ -90,37 +91,46 @@ def take_steps(folder: Path, config: RunConfig, command: str = "") -> None:
     Raises:
         ValueError: its newest checkpoint has had more than that; nothing is written.
     """
-    kept = RunConfig(**json.loads((folder / CONFIG).read_text()))
+    kept = RunConfig(**json.loads((folder / CONFIG).read_text("utf-8")))
     if kept.total_timesteps == config.total_timesteps:
         return
     gone = max((int(path.stem.rpartition("-")[2]) for path in checkpoint_files(folder)), default=0)
+    _check_steps(folder, config, gone)
+    if command and (folder / COMMAND).exists():
+        earlier = (folder / COMMAND).read_text("utf-8")
+        atomic_write(folder / COMMAND, f"{earlier}{command}\n".encode())
+    atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
+
+
+def _check_steps(folder: Path, config: RunConfig, gone: int) -> None:
+    """Raise a ValueError for fewer env steps than a run has had."""
     if config.total_timesteps < gone:
         raise ValueError(
             f"the run in {folder} has had {gone} env steps already; its steps are counted from its "
             "beginning, so give more than that"
         )
-    if command and (folder / COMMAND).exists():
-        earlier = (folder / COMMAND).read_text()
-        atomic_write(folder / COMMAND, f"{earlier}{command}\n".encode())
-    atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
 
 
 def noted_command(folder: Path, command: str = "") -> str:
     """Return what made a run, as one line of a shell; `command` where its folder does not say."""
     if not (folder / COMMAND).exists():
         return command
-    return " && ".join((folder / COMMAND).read_text().splitlines())
+    return " && ".join((folder / COMMAND).read_text("utf-8").splitlines())
 
 
 def finished_result(folder: Path, config: RunConfig) -> dict[str, Any] | None:
     """Return the result of a run that has had its steps; None for one that can go on.
 
     Raises:
-        ValueError: it ended after fewer and kept no checkpoint to go on from.
+        ValueError: it ended after fewer and kept no checkpoint to go on from; or it has had more
+            than the steps that it is given now.
     """
     if not (folder / RESULT).exists():
         return None
     result = read_result(folder)
+    kept = RunConfig(**json.loads((folder / CONFIG).read_text("utf-8")))
+    if config.total_timesteps != kept.total_timesteps:
+        _check_steps(folder, config, result["env_steps"])
     if result["env_steps"] >= config.total_timesteps or result.get("solved"):
         return result
     if not checkpoint_files(folder):
@@ -139,7 +149,7 @@ def read_result(folder: Path) -> dict[str, Any]:
     """
     path = folder / RESULT
     try:
-        result = json.loads(path.read_text())
+        result = json.loads(path.read_text("utf-8"))
         for name, kind in _RESULT.items():
             result[name] = kind(result[name])
         return dict(result)
@@ -165,7 +175,7 @@ def trained_steps(folder: str | os.PathLike[str]) -> int | None:
     if (folder / RESULT).exists():
         return int(read_result(folder)["env_steps"])
     if (folder / EVALUATIONS).exists():
-        rows = (folder / EVALUATIONS).read_text().splitlines()[1:]
+        rows = (folder / EVALUATIONS).read_text("utf-8").splitlines()[1:]
         try:
             return int(rows[-1].split(",")[0]) if rows else None
         except ValueError as error:

@@ -146,11 +146,13 @@ class RunStages:
             self.stop,
         )
         total = self.config.total_timesteps
-        try:
-            self.run.learn(total, callback=CallbackList([evaluation, keeper, writer]))
-        except Solved:
-            self.solved = True
-            writer.write()
+        if not keeper.solved:  # as one is that was stopped in its final test
+            try:
+                self.run.learn(total, callback=CallbackList([evaluation, keeper, writer]))
+            except Solved:
+                writer.write()
+        self.solved = keeper.solved
+        if self.solved:
             self.run.report(
                 f"solved after {self.run.env_steps} env steps of {total}: "
                 f"{keeper.solved_validations} validations in a row of {keeper.solved_at:g} or more"

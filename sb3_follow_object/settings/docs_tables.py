@@ -54,4 +54,4 @@ def _preset() -> dict[str, str]:
 
 if __name__ == "__main__":
     for file in map(Path, sys.argv[1:]):
-        file.write_text(with_tables(file.read_text()))
+        file.write_text(with_tables(file.read_text("utf-8")), "utf-8")

@@ -12,6 +12,7 @@ from typing import Any
 from ..any_task.tasks import (
     check_followable,
     registered_horizon,
+    steps_of_object,
     success_distance_of,
     surface_choices,
 )
@@ -123,12 +124,12 @@ def run_config(
             if surface_choices(env_id)[0]:
                 settings = of_runs | _flattened(_entry(entries, SIMILAR[True], path), path)
             _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
-    ours = file is None and preset == "default"  # the paper's cycles are the paper's
-    if ours and env_id not in IDS and env_id not in entries:
-        _fit_to_horizon(settings, registered_horizon(env_id) or _HORIZON)
     of_object = object_id(env_id if env_id in IDS else SIMILAR[False])
     if has_object_stage and _find(entries, of_object) is not None:
         settings |= _object_stage(_entry(entries, of_object, path), path)
+    ours = file is None and preset == "default"  # the paper's cycles are the paper's
+    if ours and env_id not in IDS and env_id not in entries:
+        _fit_to_horizon(settings, env_id)
     changes: dict[str, Any] = {}
     for name, value in (overrides or {}).items():
         _override(changes, name, value)
@@ -196,7 +197,7 @@ def load_config(folder: str | os.PathLike[str]) -> RunConfig:
     """
     path = Path(folder) / CONFIG
     try:
-        saved = json.loads(path.read_text())
+        saved = json.loads(path.read_text("utf-8"))
         config = RunConfig(**{**saved, "settings": saved["settings"]})  # without, it is none
         import_task(config.full_id)
         return config
@@ -228,7 +229,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         ValueError: the file is missing, is not YAML, or is not such a mapping.
     """
     try:
-        entries = load_yaml(path.read_text())
+        entries = load_yaml(path.read_text("utf-8"))
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
     except ValueError as error:
@@ -357,13 +358,24 @@ def _scale_distances(settings: dict[str, Any], factor: float) -> None:
                     settings[outer] = {**group, name: round(metres * factor, 6)}
 
 
-def _fit_to_horizon(settings: dict[str, Any], horizon: int) -> None:
+def _fit_to_horizon(settings: dict[str, Any], env_id: str) -> None:
     """Keep updates and tests per env step what they are in the presets' episodes."""
-    updates = settings.get("gradient_steps", -1)
-    if updates > 0:
-        settings["gradient_steps"] = max(1, round(updates * horizon / _HORIZON))
-    if "test_every" in settings:
-        settings["test_every"] = max(1, round(settings["test_every"] * _HORIZON / horizon))
+    horizon = registered_horizon(env_id)
+    if horizon in (None, _HORIZON):
+        return
+    robot, alone = horizon / _HORIZON, steps_of_object(env_id, horizon) / _HORIZON
+    reach, of_object = settings.get("reach"), settings.get("object_algorithm")
+    if reach is not None:
+        reach.setdefault("n_updates", ReachTeachingSettings.n_updates)
+    for group, name, factor in (
+        (settings, "gradient_steps", robot),
+        (settings, "test_every", 1 / robot),
+        (reach or {}, "n_updates", robot),
+        (of_object or {}, "gradient_steps", alone),
+        (settings, "object_test_every", 1 / alone),
+    ):
+        if group.get(name, -1) > 0:
+            group[name] = max(1, round(group[name] * factor))
 
 
 def _override(settings: dict[str, Any], name: str, value: Any) -> None:

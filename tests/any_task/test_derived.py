@@ -19,6 +19,7 @@ from sb3_follow_object.any_task.derived import Derived, derived
 from sb3_follow_object.any_task.resets import record_resets
 from sb3_follow_object.any_task.simulation import DerivedObjectVecEnv, turned_about_vertical
 from sb3_follow_object.common.cache import CACHE_VARIABLE
+from sb3_follow_object.settings.presets import run_config
 
 
 class Tidy(Kitchen):
@@ -192,6 +193,15 @@ def few_resets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def alone(found: Derived, n_envs: int = 3, **options: Any) -> DerivedObjectVecEnv:
     return DerivedObjectVecEnv(found.scene, n_envs, 1, seed=0, **options)
+
+
+def test_updates_and_tests_follow_the_length_of_episodes() -> None:
+    settings = run_config("Tidy-v0").settings  # 40 steps; the preset's are 50
+    assert settings["algorithm"]["gradient_steps"] == 240 * 40 // 50
+    assert settings["object_algorithm"]["gradient_steps"] == 120 * 40 // 50
+    assert settings["reach"]["n_updates"] == 120 * 40 // 50
+    assert (settings["test_every"], settings["object_test_every"]) == (5, 5)
+    assert "n_updates" not in run_config(arm_and_wall.ARM).settings["reach"]
 
 
 def test_the_tutorials_task_is_found_out() -> None:

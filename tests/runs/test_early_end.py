@@ -12,6 +12,7 @@ from tiny_runs import config, outcome, quiet
 
 import sb3_follow_object.callbacks.eval_callback as eval_callback
 from sb3_follow_object.callbacks.rollout import Episodes
+from sb3_follow_object.runs import stages
 from sb3_follow_object.runs.experiment import train
 
 SOLVED = config(solved_at=0.9, solved_validations=2, eval_every=300)
@@ -64,6 +65,24 @@ def test_an_interrupted_run_counts_on_and_ends_as_the_uninterrupted_one(
     validations += [0.9, 0.9]  # the checkpoint is of the rollout before
     train(SOLVED, tmp_path / "part", resume=True, report=quiet)
     assert not validations
+    assert outcome(tmp_path / "part") == outcome(tmp_path / "whole")
+
+
+def test_a_solved_run_that_is_stopped_in_its_final_test_has_ended(
+    validations: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    validations += [0.9, 0.9]
+    train(SOLVED, tmp_path / "whole", report=quiet)
+
+    def interrupt(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    validations += [0.9, 0.9]
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(stages, "evaluate", interrupt)
+        train(SOLVED, tmp_path / "part", report=quiet)
+    result = train(SOLVED, tmp_path / "part", resume=True, report=quiet)
+    assert result["solved"] is True
     assert outcome(tmp_path / "part") == outcome(tmp_path / "whole")
 
 

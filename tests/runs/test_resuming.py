@@ -16,7 +16,7 @@ import pytest
 import tiny_runs as runs
 import torch as th
 
-from sb3_follow_object.common.array_trees import load_tree, save_tree
+from sb3_follow_object.common.array_trees import Snapshot, load_tree, save_tree
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.object_stage.networks import FILE as OBJECT_FILE
 from sb3_follow_object.object_stage.networks import ObjectNetworks
@@ -247,6 +247,34 @@ def test_finished_run_without_a_checkpoint_is_given_no_more_steps(tmp_path: Path
     with pytest.raises(ValueError, match=r"ended after \d+ env steps and kept no checkpoint"):
         runs.run(tmp_path, resume=True)
     assert runs.outcome(tmp_path) == kept
+
+
+def test_finished_run_is_given_no_fewer_steps_than_it_has_had(tmp_path: Path) -> None:
+    runs.run(tmp_path, config=runs.config(total_timesteps=2400))
+    fewer = runs.config(total_timesteps=1500)
+    with pytest.raises(ValueError, match=r"has had \d+ env steps already; its steps are counted"):
+        train(fewer, tmp_path, resume=True, report=runs.quiet)
+
+
+def test_checkpoint_that_cannot_be_written_is_told_whatever_the_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    checkpoints = Checkpoints(tmp_path, 3, told.append)
+    checkpoints.write(10, {"steps": 10})
+    checkpoints.wait()
+
+    def fail(*arguments: Any) -> None:
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(Snapshot, "write", fail)
+    checkpoints.write(20, {"steps": 20})
+    checkpoints.wait()
+    (kept,) = checkpoint_files(tmp_path)
+    assert told[1] == (
+        "the checkpoint at 20 env steps could not be written (no room); the last good one is "
+        f"{kept.name}"
+    )
 
 
 def test_only_the_last_checkpoints_are_kept(tmp_path: Path) -> None:
