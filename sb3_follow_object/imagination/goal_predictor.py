@@ -26,6 +26,7 @@ from .predictor_files import (
     checked_facts,
     checked_tensors,
     n_inputs,
+    without_module,
 )
 from .predictor_training import (
     Progress,
@@ -51,7 +52,7 @@ class GoalPredictor(WholeCopies):
 
     Attributes:
         horizon: T, the largest k.
-        env_id: gymnasium id of the task that it was made for.
+        env_id: gymnasium id of the task that it was made for, without a module before it.
         physics: short hash of the physics that it was made for.
         object_on_table: whether the object was kept on the table; None where that is not known.
         space: of its positions and goals.
@@ -79,7 +80,7 @@ class GoalPredictor(WholeCopies):
     ) -> None:
         self.hidden = tuple(hidden)
         self.horizon = horizon
-        self.env_id = env_id
+        self.env_id = without_module(env_id)
         self.physics = physics
         self.object_on_table = object_on_table
         self.context = tuple(context)
@@ -127,7 +128,7 @@ class GoalPredictor(WholeCopies):
         Args:
             paths: object positions o_1..o_{T+1} of n episodes, shape (n, T+1, 3), metres.
             goals: their goals g, shape (n, 3), metres.
-            env_id: gymnasium id of the task, kept with the predictor.
+            env_id: gymnasium id of the task, kept with the predictor; a module before it is not.
             physics: hash of the task's physics, kept with the predictor.
             object_on_table: whether the object was kept on the table, kept with the predictor.
             context: names of the numbers that the paths depend on beside start and goal.
@@ -328,7 +329,7 @@ class GoalPredictor(WholeCopies):
 
         Args:
             folder: holds the two files.
-            env_id: the task that it is wanted for; None accepts any.
+            env_id: the task that it is wanted for, with or without a module; None accepts any.
             physics: the physics that it is wanted for; None accepts any.
             object_on_table: whether the object should have been kept on the table; None accepts
                 both, and a predictor that does not say is accepted always.
@@ -339,7 +340,7 @@ class GoalPredictor(WholeCopies):
         """
         folder = Path(folder)
         facts = checked_facts(folder / FACTS_FILE)
-        wanted = {"env_id": env_id, "physics": physics}
+        wanted = {"env_id": env_id and without_module(env_id), "physics": physics}
         for name, value in wanted.items():
             if value is not None and facts[name] != value:
                 raise ValueError(

@@ -32,6 +32,11 @@ def n_inputs(goals: GoalSpace, context: Sequence[str]) -> int:
     return 2 * goals.n_encoded + len(context) + 1
 
 
+def without_module(env_id: str) -> str:
+    """Return an id as `gymnasium.make` tells it in a spec, by which files name a task."""
+    return env_id.rpartition(":")[2]
+
+
 def valid_hidden(hidden: Any) -> bool:
     """Whether this is a list of widths of hidden layers."""
     return (
@@ -57,6 +62,7 @@ def checked_facts(path: Path) -> dict[str, Any]:
     for name in ("env_id", "physics", "sha256"):
         if not isinstance(facts.get(name), str):
             raise ValueError(f"{damaged}: {name} must be a string, got {facts.get(name)!r}.")
+    facts["env_id"] = without_module(facts["env_id"])  # files of before hold it as it was given
     if not isinstance(facts.get("object_on_table"), bool | None):
         raise ValueError(f"{damaged}: object_on_table must be true, false or null.")
     horizon, errors = facts.get("horizon"), facts.get("error_mm")

@@ -18,7 +18,7 @@ from ..common.reports import reason
 from ..common.torch_helpers import WholeModule, lowest, usual_defaults
 from ..ddpg.her_ddpg import HerDDPG
 from ..ddpg.policies import HerPolicy, NormalizedGoalExtractor
-from ..imagination.predictor_files import CONTEXT_LIMIT, valid_hidden
+from ..imagination.predictor_files import CONTEXT_LIMIT, valid_hidden, without_module
 from ..settings.kinds import CRITICS_LIMIT
 from ..settings.learning import InverseSettings
 
@@ -36,7 +36,8 @@ class ObjectNetworks(WholeModule):
     Made by `learned` or `load`.
 
     Args:
-        env_id: gymnasium id of the robot's task that it was made for.
+        env_id: gymnasium id of the robot's task that it was made for; a module before it is not
+            kept.
         physics: short hash of the physics that it was made for.
         pi, qf, inverse: widths of the hidden layers of policy, critics and inverse model.
         n_critics: whose lowest value counts.
@@ -61,7 +62,7 @@ class ObjectNetworks(WholeModule):
         n_context: int = 0,
     ) -> None:
         super().__init__()
-        self.env_id = env_id
+        self.env_id = without_module(env_id)
         self.physics = physics
         self.shape: dict[str, Any] = {
             "pi": list(pi),
@@ -240,7 +241,7 @@ class ObjectNetworks(WholeModule):
 
         Args:
             path: of the file.
-            env_id: the task that it is wanted for; None accepts any.
+            env_id: the task that it is wanted for, with or without a module; None accepts any.
             physics: the physics that it is wanted for; None accepts any.
 
         Raises:
@@ -265,6 +266,7 @@ class ObjectNetworks(WholeModule):
 
     def check(self, env_id: str | None, physics: str | None, what: str) -> None:
         """Raise a ValueError unless they were made for this task and physics."""
+        env_id = env_id and without_module(env_id)
         for name, wanted in (("env_id", env_id), ("physics", physics)):
             found = getattr(self, name)
             if wanted is not None and found != wanted:

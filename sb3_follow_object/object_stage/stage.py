@@ -21,6 +21,7 @@ from ..common.reports import Report
 from ..common.seeds import stream_seed
 from ..ddpg.her_ddpg import HerDDPG
 from ..imagination.goal_predictor import GoalPredictor
+from ..imagination.predictor_files import without_module
 from .networks import ObjectNetworks
 from .policy import (
     StopWhenSolved,
@@ -70,10 +71,11 @@ class ObjectStage:
             ValueError: it was made for another task, for other physics, or from an object that
                 was kept on the table where this one's is not, or the other way round.
         """
-        if predictor.env_id != self.env_id or predictor.physics != physics_of_task(self.env_id):
+        task, physics = without_module(self.env_id), physics_of_task(self.env_id)
+        if (predictor.env_id, predictor.physics) != (task, physics):
             raise ValueError(
                 f"the predictor was made for {predictor.env_id} (physics {predictor.physics}), "
-                f"not for {self.env_id} (physics {physics_of_task(self.env_id)}); make a new one"
+                f"not for {task} (physics {physics}); make a new one"
             )
         choices = self._choices()
         if predictor.object_on_table not in (None, *choices):

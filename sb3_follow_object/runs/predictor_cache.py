@@ -11,6 +11,7 @@ from ..common.cache import CACHE_VARIABLE as CACHE_VARIABLE
 from ..common.cache import SET_THE_VARIABLE, cache_folder
 from ..common.files import lock
 from ..common.reports import Report
+from ..envs.registration import import_task
 from ..follow_object.follow_object import FollowObject
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.predictor_files import FACTS_FILE
@@ -28,7 +29,8 @@ def get_predictor(
     """Return a task's F_phi, learned with the default settings the first time it is asked for.
 
     Args:
-        env_id: a task of this package, or any other whose object can be followed.
+        env_id: a task of this package, or any other whose object can be followed; "module:" may
+            stand before it, and what is kept is the same.
         folder: where the predictor is kept; by default a folder for this task and its physics in
             $SB3_FOLLOW_OBJECT_CACHE or in the user's cache. What is there is read, not written.
         report: called with a sentence now and then while it is learned, which takes minutes.
@@ -38,6 +40,7 @@ def get_predictor(
             object_on_table, a damaged one, or an object's networks alone; it holds none and cannot
             be written; or the task's object cannot be followed.
     """
+    env_id = import_task(env_id)
     path = _kept(FACTS_FILE, env_id, folder, report)
     choices = surface_choices(env_id)
     on_table = choices[0] if len(choices) == 1 else None  # else the object's learning has decided
@@ -51,6 +54,7 @@ def kept_predictor(env_id: str) -> GoalPredictor | None:
     Raises:
         ValueError: the task's object cannot be followed, or what is kept is damaged.
     """
+    env_id = import_task(env_id)
     folder = cache_folder() / env_id / kept_as(env_id)
     if not (folder / FACTS_FILE).exists():
         return None
@@ -65,6 +69,7 @@ def get_object_networks(
     Raises:
         ValueError: as `get_predictor`; or the folder holds F_phi alone, which is not replaced.
     """
+    env_id = import_task(env_id)
     path = _kept(OBJECT_FILE, env_id, folder, report)
     return ObjectNetworks.load(path, env_id=env_id, physics=physics_of_task(env_id))
 

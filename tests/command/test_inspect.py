@@ -73,7 +73,7 @@ def test_it_draws_starts_and_goals(can_draw: None, tmp_path: Path) -> None:
 def test_it_draws_imagined_goals_where_there_is_an_f_phi(
     can_draw: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    predictor = learn_predictor(config(env_id=arm_and_wall.ARM), tmp_path / "phi", quiet)
+    predictor = learn_predictor(config(env_id=ARM), tmp_path / "phi", quiet)
     command = ["inspect", "--env", ARM, "--out", str(tmp_path / "arm.png")]
     assert main(command) == 0
     assert imageio.imread(tmp_path / "arm.png").shape == (480, 480, 3)

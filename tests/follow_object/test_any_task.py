@@ -258,6 +258,32 @@ def test_a_predictor_that_is_found_by_itself_sees_the_wall(
     env.close()
 
 
+def test_an_id_has_one_predictor_with_a_module_before_it_and_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned: list[str] = []
+    learn = predictor_cache.learn_predictor
+
+    def learn_once(run: Any, *arguments: Any) -> GoalPredictor:
+        learned.append(run.env_id)
+        return learn(run, *arguments)
+
+    monkeypatch.setattr(predictor_cache, "learn_predictor", learn_once)
+    monkeypatch.setattr(predictor_cache, "run_config", lambda env_id: config(env_id=env_id))
+    full_id = f"arm_and_wall:{ARM}"
+    predictor = predictor_cache.get_predictor(full_id, report=quiet)
+    env = ImaginedGoalWrapper(gym.make(full_id), curriculum={"p": 0.0})
+    np.testing.assert_array_equal(env.predictor.error_mm, predictor.error_mm)
+    assert predictor_cache.get_object_networks(full_id, report=quiet).env_id == ARM
+    assert learned == [ARM]
+    found = (tmp_path / "cache").rglob(FACTS_FILE)
+    assert list(found) == [tmp_path / "cache" / ARM / kept_as(ARM) / FACTS_FILE]
+    for env_id in (full_id, ARM):
+        assert FollowObject(env_id, predictor=predictor, **TINY).predictor is predictor
+    with pytest.raises(ValueError, match=f"was made for {ARM} .* not for {moving_wall.WALL} "):
+        FollowObject(f"moving_wall:{moving_wall.WALL}", predictor=predictor, **TINY)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

@@ -188,6 +188,20 @@ def edit_facts(folder: Path, **changes: Any) -> None:
     (folder / FACTS_FILE).write_text(json.dumps({**facts, **changes}))
 
 
+def test_a_module_before_the_id_is_no_part_of_a_tasks_name(tmp_path: Path) -> None:
+    small = {**SMALL, "hidden": (4,)}
+    for env_id in ("Toy-v0", "Own/Toy-v0"):
+        made = GoalPredictor.fit(*toy.paths(8), **{**small, "env_id": f"a.module:{env_id}"})
+        assert made.env_id == env_id
+        made.save(tmp_path)
+        assert json.loads((tmp_path / FACTS_FILE).read_text())["env_id"] == env_id
+        edit_facts(tmp_path, env_id=f"a.module:{env_id}")  # as files of before have it
+        for wanted in (env_id, f"a.module:{env_id}", f"another:{env_id}"):
+            assert GoalPredictor.load(tmp_path, env_id=wanted).env_id == env_id
+        with pytest.raises(ValueError, match=f"made for env_id '{env_id}', not for 'Other-v0'"):
+            GoalPredictor.load(tmp_path, env_id="a.module:Other-v0")
+
+
 def edit_tensors(folder: Path, **changes: torch.Tensor) -> None:
     """Change tensors and sign them anew, so that only the later checks can notice."""
     tensors = safetensors.torch.load((folder / TENSORS_FILE).read_bytes())

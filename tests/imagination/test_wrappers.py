@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -21,6 +22,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_follow_object.imagination.curriculum import Curriculum
+from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
 
@@ -243,6 +245,17 @@ def test_a_fetch_task_of_gymnasium_robotics() -> None:
         check_transitions(curriculum, finished)
     one.close()
     many.close()
+
+
+def test_a_folder_of_a_task_that_was_learned_with_a_module_before_its_id(tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    env_id = "gymnasium_robotics:FetchPush-v4"
+    line = np.tile(np.linspace([1.3, 0.7, 0.42], [1.4, 0.8, 0.42], 51), (8, 1, 1))
+    fit: dict[str, Any] = {"physics": "a line", "hidden": (4,), "epochs": 1}
+    GoalPredictor.fit(line, line[:, -1], env_id=env_id, **fit).save(tmp_path)
+    env = ImaginedGoalWrapper(gym.make(env_id), predictor=tmp_path)
+    assert (env.predictor.env_id, env.predictor.physics) == ("FetchPush-v4", "a line")
+    env.close()
 
 
 # With stock algorithms

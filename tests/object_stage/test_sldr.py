@@ -391,6 +391,20 @@ def test_half_an_object_stage_in_the_cache_is_learned_whole(
     assert learned == [tmp_path / TASK / physics_id(TASK)]
 
 
+def test_networks_name_their_task_without_a_module(tmp_path: Path) -> None:
+    path = tmp_path / "networks"
+    made = ObjectNetworks(f"a.module:{TASK}", "b", pi=[8], qf=[8], inverse=[8])
+    assert made.env_id == TASK
+    made.save(path)
+    saved = load_tree(path)
+    assert saved["env_id"] == TASK
+    save_tree(path, {**saved, "env_id": f"a.module:{TASK}"})  # as files of before have it
+    for wanted in (TASK, f"a.module:{TASK}"):
+        assert ObjectNetworks.load(path, env_id=wanted).env_id == TASK
+    with pytest.raises(ValueError, match=f"made for env_id '{TASK}', not for 'Other-v0'"):
+        ObjectNetworks.load(path, env_id="a.module:Other-v0")
+
+
 def test_networks_of_other_physics_are_refused(tmp_path: Path) -> None:
     tiny_networks().save(tmp_path / "networks")
     with pytest.raises(ValueError, match="were made for physics"):

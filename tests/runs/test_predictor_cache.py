@@ -23,6 +23,7 @@ from sb3_follow_object.runs.predictor_cache import (
     cache_folder,
     get_object_networks,
     get_predictor,
+    kept_predictor,
 )
 
 
@@ -48,6 +49,22 @@ def test_what_a_read_only_cache_holds_is_read(
         (folder,) = (cache / TASK).iterdir()
         assert get_predictor(TASK, folder).env_id == TASK
         assert {path.name for path in cache.rglob("*")} == before
+
+
+@pytest.mark.usefixtures("never_learned")
+@pytest.mark.parametrize("kept", [None, "folder"])
+def test_a_module_before_the_id_is_the_same_task(
+    kept: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache_predictor(tmp_path)
+    cache_networks(tmp_path)
+    (folder,) = (tmp_path / TASK).iterdir()
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "empty" if kept else tmp_path))
+    full_id, given = f"sb3_follow_object:{TASK}", folder if kept else None
+    assert get_predictor(full_id, given).env_id == TASK
+    assert get_object_networks(full_id, given).env_id == TASK
+    predictor = kept_predictor(full_id)
+    assert predictor is None if kept else predictor is not None and predictor.env_id == TASK
 
 
 @pytest.mark.usefixtures("never_learned")
