@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..envs import TASKS
+from ..envs import IDS
 from ..object_stage.sldr import reads_object_networks
 from ..runs.object_stage_files import OBJECT_STAGE
 from ..runs.run_folder import CONFIG, RESULT, claim
@@ -87,8 +87,8 @@ class Cell:
 
 def task_name(env_id: str) -> str:
     """Return the short name of one of the package's tasks, or another environment's id."""
-    name = env_id.rpartition(":")[2].removeprefix("FollowObject/").removesuffix("-v0")
-    return name if name in TASKS else env_id
+    task, alone = IDS.get(env_id.rpartition(":")[2], (None, False))
+    return env_id if task is None or alone else task.name
 
 
 def needs_object_stage(config: RunConfig) -> bool:
@@ -124,8 +124,8 @@ def shared_stage(cell: Cell) -> Path | None:
     """Make the folder of the object stage that the cell's run will share, and return it.
 
     Returns:
-        None where the run needs none or has begun already, and where the one of its task and seed
-        is another's, with other settings: the run then makes its own.
+        None where the run needs none or has begun already, and where the one of its folder's name
+        is of another task or of other settings: the run then makes its own.
     """
     stage = cell.stage
     if stage is None or (cell.folder / CONFIG).exists():
@@ -134,7 +134,8 @@ def shared_stage(cell: Cell) -> Path | None:
         # A whole one, with F_phi, serves the runs that do not imagine goals as well.
         settings = {**cell.config.settings, "imagine": True}
         _claim_whole(stage, replace(cell.config, settings=settings))
-    same = stage_settings(load_config(stage)) == stage_settings(cell.config)
+    kept, wanted = load_config(stage), cell.config
+    same = kept.env_id == wanted.env_id and stage_settings(kept) == stage_settings(wanted)
     return stage if same else None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,8 @@ def plan(
         threads: of each run's simulation and of its PyTorch, where the settings do not say.
 
     Raises:
-        ValueError: an unknown name, or the folder holds results of other settings.
+        ValueError: an unknown name, two tasks whose runs would have one folder, or the folder holds
+            results of other settings.
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
@@ -57,7 +58,10 @@ def plan(
     for method in methods:
         if method not in METHODS:
             raise ValueError(f"there is no method {method!r}{did_you_mean(method, METHODS)}")
-    ids = {task_name(env_id): env_id for env_id in map(_env_id, tasks)}
+    ids: dict[str, str] = {}
+    for env_id in map(_env_id, tasks):  # one name is one task, with a module before its id or not
+        ids.setdefault(task_name(env_id), env_id)
+    _check_apart(ids, methods)
     read = {(e, m): _read_by(e, m, settings) for e in ids.values() for m in methods}
     for name in settings.overrides or {}:
         if not any(name in (its.overrides or {}) for its in read.values()):
@@ -69,7 +73,7 @@ def plan(
             for method in dict.fromkeys(methods):
                 own = read[env_id, method]
                 config = _config(env_id, method, seed, own, threads)
-                path = folder / f"{file_name(task)}-{method}-{seed}"
+                path = folder / f"{_begins(task, method)}-{seed}"
                 command = _command(path, config, own)
                 cell = Cell(path, task, config, command)
                 kept = _kept_config(cell)
@@ -77,6 +81,25 @@ def plan(
                     cell = replace(cell, config=kept, command=_command(path, kept, own))
                 cells.append(cell)
     return cells
+
+
+def _check_apart(ids: Mapping[str, str], methods: Sequence[str]) -> None:
+    """Raise a ValueError where runs of two tasks would have one folder."""
+    kept: dict[str, str] = {}
+    for task, env_id in ids.items():
+        for method in dict.fromkeys(methods):
+            begins = _begins(task, method)
+            other = kept.setdefault(begins, env_id)
+            if other != env_id:
+                raise ValueError(
+                    f"{other!r} and {env_id!r} would both be kept in {begins}-<seed>; "
+                    "compare them in folders of their own"
+                )
+
+
+def _begins(task: str, method: str) -> str:
+    """Return how the names of a task's and a method's folders begin; a seed comes after it."""
+    return f"{file_name(task)}-{method}"
 
 
 def _read_by(env_id: str, method: str, settings: Settings) -> Settings:

@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
+import toy
+from gymnasium.envs.registration import EnvSpec
 
 from sb3_follow_object.command.cli import _COMMANDS, _config
 from sb3_follow_object.command.cli_options import make_parser
-from sb3_follow_object.comparison.cells import Settings, prepare, shared_stage, stage_settings
+from sb3_follow_object.comparison.cells import (
+    Settings,
+    prepare,
+    shared_stage,
+    stage_settings,
+    task_name,
+)
 from sb3_follow_object.comparison.grid import plan
 from sb3_follow_object.comparison.ledger import Ledger, read_grid
 from sb3_follow_object.runs.object_stage_files import OBJECT_STAGE
@@ -38,6 +48,71 @@ def test_ids_and_short_names_are_one_task_and_others_keep_their_id(tmp_path: Pat
     tasks = ["FollowObject/PnPShelf-v0", "PnPShelf", "FetchReach-v4"]
     cells = plan(tmp_path, tasks, ["her"], [0], SETTINGS)
     assert [cell.name for cell in cells] == ["PnPShelf-her-0", "FetchReach-v4-her-0"]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name"),
+    [
+        ("FollowObject/PnPShelf-v0", "PnPShelf"),
+        ("sb3_follow_object:FollowObject/PnPShelf-v0", "PnPShelf"),
+        *(
+            (env_id, env_id)
+            for env_id in (
+                "PnPShelf-v0",
+                "mine:PnPShelf-v0",
+                "FollowObject/PnPShelf",
+                "PnPShelf-v1",
+            )
+        ),
+        *(
+            (kept, kept)
+            for kept in ("FetchPush-v4", "MetaWorld/push-wall", "arm_and_wall:ArmAndWall")
+        ),
+    ],
+)
+def test_only_this_packages_ids_are_shortened(env_id: str, name: str) -> None:
+    assert task_name(env_id) == name
+
+
+def register(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = EnvSpec(env_id, entry_point=toy.PointEnv, max_episode_steps=toy.HORIZON)
+    monkeypatch.setitem(gym.registry, env_id, spec)
+
+
+def test_tasks_of_others_that_are_called_as_this_packages_are_tasks_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    register("PnPShelf-v0", monkeypatch)
+    tasks = ["PnPShelf", "PnPShelf-v0", "sb3_follow_object:FollowObject/PnPShelf-v0"]
+    cells = plan(tmp_path, tasks, ["her"], [0], SETTINGS)
+    assert {cell.name: cell.config.env_id for cell in cells} == {
+        "PnPShelf-her-0": "FollowObject/PnPShelf-v0",
+        "PnPShelf-v0-her-0": "PnPShelf-v0",
+    }
+
+
+@pytest.mark.parametrize(
+    ("tasks", "methods", "folder"),
+    [
+        (("a/Reach-v0", "a_Reach-v0"), ["her"], "a_Reach-v0-her"),
+        (("Reach-fo", "Reach"), ["sldr", "fo-sldr"], "Reach-fo-sldr"),
+    ],
+)
+def test_tasks_whose_runs_would_have_one_folder_are_refused(
+    tasks: tuple[str, str],
+    methods: list[str],
+    folder: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for env_id in tasks:
+        register(env_id, monkeypatch)
+    with pytest.raises(ValueError) as error:
+        plan(tmp_path, tasks, methods, [0, 1], SETTINGS)
+    assert str(error.value) == (
+        f"{tasks[0]!r} and {tasks[1]!r} would both be kept in {folder}-<seed>; "
+        "compare them in folders of their own"
+    )
 
 
 def test_command_trains_the_same_run(tmp_path: Path) -> None:
@@ -196,6 +271,15 @@ def test_stage_of_other_settings_is_not_shared(tmp_path: Path) -> None:
     (differs,) = plan(tmp_path, ["PnPShelf"], ["fo"], [0], other)
     assert stage_settings(differs.config) != stage_settings(cell.config)
     assert shared_stage(differs) is None
+
+
+def test_stage_of_another_task_is_not_shared(tmp_path: Path) -> None:
+    """Its folder's name may be that of an earlier command's task, as `a/b` and `a_b` have one."""
+    (cell,) = plan(tmp_path, ["PnPShelf"], ["fo"], [0], SETTINGS)
+    assert shared_stage(cell) is not None
+    other = replace(cell, config=replace(cell.config, env_id="FollowObject/PnPObstacle-v0"))
+    assert stage_settings(other.config) == stage_settings(cell.config)
+    assert shared_stage(other) is None
 
 
 def test_finished_run_stays_finished(tmp_path: Path) -> None:
