@@ -75,7 +75,7 @@ class Comparison:
         self._stopping = False
 
     def run(self) -> list[str]:
-        """Run until nothing is left to do; return the names of the cells that failed.
+        """Run until nothing is left to do; return the names of runs and cross tests that failed.
 
         Raises:
             KeyboardInterrupt: on Ctrl-C or SIGTERM, once all runs have written a checkpoint.
@@ -100,11 +100,7 @@ class Comparison:
                 raise
         if self._requests:
             raise KeyboardInterrupt
-        return [
-            name
-            for name, cell in self._cells.items()
-            if not cell.finished and self._ledger.failed(name)
-        ]
+        return [name for cell in self._cells.values() if (name := self._failure(cell))]
 
     def _listen(self) -> None:
         for name, message in self._executor.messages(_POLL):
@@ -140,6 +136,17 @@ class Comparison:
     def _failed(self, cell: Cell) -> bool:
         return self._ledger.failed(cell.name)
 
+    def _failure(self, cell: Cell) -> str | None:
+        """Return what failed of a cell, by its name: its run or, after that, its cross test."""
+        if not cell.finished:
+            return cell.name if self._failed(cell) else None
+        cross = _cross_name(cell)
+        return cross if self._given_up(cross) else None
+
+    def _given_up(self, name: str) -> bool:
+        """Whether an object stage or a cross test has used up its attempts."""
+        return self._failures.get(name, 0) >= ATTEMPTS
+
     def _next_job(self) -> Job | None:
         """Return what to do next in the cells' order, None while all that is left must wait."""
         for cell in self._cells.values():
@@ -157,7 +164,7 @@ class Comparison:
         stage = shared_stage(cell)
         if stage is not None and not stage_is_ready(stage):
             name = f"{OBJECT}/{stage.name}"
-            if self._failures.get(name, 0) >= ATTEMPTS:
+            if self._given_up(name):
                 error = f"its object stage failed (see {name})"
                 self._ledger.note_failure(cell.name, error, final=True)
                 return None
@@ -167,13 +174,13 @@ class Comparison:
 
     def _cross_job(self, cell: Cell) -> Job | None:
         other = partner(cell.task)
-        name = f"{cell.name} on {other}"
         if other is None:
             return None
+        name = _cross_name(cell)
         kept = read_cross_tests(cell.folder).get(other)
         if kept is not None and kept["episodes"] >= cell.config.n_final_episodes:
             return None
-        if self._failures.get(name, 0) >= ATTEMPTS or not (cell.folder / POLICY).exists():
+        if self._given_up(name) or not (cell.folder / POLICY).exists():
             return None
         env_id = cell.config.env_id.replace(cell.task, other)
         return Job(CROSS, name, str(cell.folder), self._threads, other=env_id)
@@ -199,9 +206,13 @@ class Comparison:
             last = self._ledger.failed(name)
         else:
             self._failures[name] = self._failures.get(name, 0) + 1
-            last = self._failures[name] >= ATTEMPTS
+            last = self._given_up(name)
         again = "it failed twice and is given up" if last else "it is taken up once more"
         self._display.say(Trouble(f"{name} failed: {error}; {again}"))
+
+
+def _cross_name(cell: Cell) -> str:
+    return f"{cell.name} on {partner(cell.task)}"
 
 
 def write_report(folder: Path, say: Callable[[str], None]) -> None:

@@ -18,7 +18,7 @@ from result_folders import finish
 
 from sb3_follow_object.command import cli
 from sb3_follow_object.common.files import lock
-from sb3_follow_object.comparison import figures
+from sb3_follow_object.comparison import executors, figures
 from sb3_follow_object.comparison.cells import Cell, Settings, prepare
 from sb3_follow_object.comparison.compare import Comparison, share_cores
 from sb3_follow_object.comparison.cross import CROSS_TESTS
@@ -226,6 +226,41 @@ def test_versions_of_pnp_simple_are_tested_on_each_other(tmp_path: Path) -> None
     executor = FakeExecutor(do_it)
     assert comparison(tmp_path, executor, cells)[0].run() == []
     assert [job.name for job in executor.jobs] == ["PnPSimpleV1-her-0 on PnPSimpleV2"]
+
+
+def test_cross_test_that_fails_twice_is_a_failure_and_is_tried_by_the_next_command(
+    tmp_path: Path,
+) -> None:
+    failing = {"PnPSimpleV1-her-0 on PnPSimpleV2": 2, "PnPSimpleV2-her-0 on PnPSimpleV1": 1}
+
+    def do(job: Job) -> list[Message]:
+        if failing.get(job.name, 0) == 0:
+            return do_it(job)
+        failing[job.name] -= 1
+        return [{"failed": "MemoryError"}]
+
+    cells = plan(tmp_path, ["PnPSimpleV1", "PnPSimpleV2", "PnPShelf"], ["her"], [0], SETTINGS)
+    executor = FakeExecutor(do)
+    failed = comparison(tmp_path, executor, cells)[0].run()
+    assert failed == ["PnPSimpleV1-her-0 on PnPSimpleV2"]
+    assert len(executor.names(CROSS)) == 4
+    again = FakeExecutor(do)
+    assert comparison(tmp_path, again, cells)[0].run() == []
+    assert again.names(CROSS) == ["PnPSimpleV1-her-0 on PnPSimpleV2"]
+
+
+def test_command_says_which_cross_test_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def do(job: Job) -> list[Message]:
+        return [{"failed": "MemoryError"}] if job.kind == CROSS else do_it(job)
+
+    monkeypatch.setattr(executors, "LocalExecutor", lambda jobs, logs: FakeExecutor(do))
+    monkeypatch.setattr(figures, "draw_results", lambda *arguments: [])
+    words = ["compare", "--out", str(tmp_path), "--tasks", "PnPSimpleV1", "PnPShelf"]
+    assert cli.main([*words, "--methods", "her", "--seeds", "0", "--steps", "1000"]) == 2
+    sentence = "1 of 2 runs failed: PnPSimpleV1-her-0 on PnPSimpleV2"
+    assert sentence in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
