@@ -70,7 +70,7 @@ def read_cross_tests(run: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
     if not path.exists():
         return {}
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text("utf-8"))
         return {
             str(task): {
                 "success_rate": float(figures["success_rate"]),

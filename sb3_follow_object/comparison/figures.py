@@ -274,7 +274,7 @@ def _read_curves(group: Group, status: str) -> list[Curve]:
 
 def _was_validated(run: Run) -> bool:
     path = run.folder / EVALUATIONS
-    return path.exists() and len(path.read_text().splitlines()) > 1
+    return path.exists() and len(path.read_text("utf-8").splitlines()) > 1
 
 
 def _figure(rows: int, columns: int) -> tuple[Any, list[Any]]:

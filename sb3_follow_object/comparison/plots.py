@@ -52,7 +52,7 @@ def read_curve(folder: str | os.PathLike[str]) -> Curve:
     path = Path(folder) / EVALUATIONS
     rows: list[dict[str, str]] = []
     if path.exists():
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
     if not rows:
         raise ValueError(f"the run in {folder} has not been validated yet: nothing to plot")

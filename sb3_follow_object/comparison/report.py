@@ -226,7 +226,7 @@ def _logged_charts(folder: Path) -> list[dict[str, Any]]:
     """Return a chart for each column of SB3's logs, which each resumption begins anew."""
     columns: dict[str, list[tuple[float, float]]] = {}
     for path in sorted(folder.glob("progress_*.csv"), key=lambda path: path.stat().st_mtime):
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8") as file:
             for row in csv.DictReader(file):
                 for name, text in row.items():
                     try:
@@ -246,7 +246,7 @@ def _add_settings(page: _Page, folders: Sequence[tuple[str, Path]]) -> None:
     """Add the settings and versions of runs, those that they share once."""
     found = {name: flat(asdict(load_config(path))) for name, path in folders}
     versions = {
-        name: json.loads((path / VERSIONS).read_text())
+        name: json.loads((path / VERSIONS).read_text("utf-8"))
         for name, path in folders
         if (path / VERSIONS).exists()
     }
