@@ -194,6 +194,7 @@ def _resumed_config(args: argparse.Namespace) -> RunConfig:
 
 def _evaluate(args: argparse.Namespace) -> None:
     from ..comparison.cross import cross_test
+    from ..imagination.predictor_files import without_module
     from ..runs.evaluation import evaluate
     from ..runs.run_folder import trained_steps
     from ..settings.presets import load_config
@@ -202,7 +203,7 @@ def _evaluate(args: argparse.Namespace) -> None:
     env_id = args.env or config.env_id
     seed = config.seed if args.seed is None else args.seed
     policy = policy_of(args.run)
-    if env_id in (config.env_id, config.full_id):
+    if without_module(env_id) == without_module(config.env_id):
         episodes = evaluate(policy, env_id, args.episodes, seed)
         rate, reached = episodes.success_rate, float(episodes.reached.mean())
     else:

@@ -23,6 +23,7 @@ from ..envs.goal_envs import known_id
 from ..envs.robot_face import EffectorOf, GoalOf, Judge
 from ..imagination.curriculum import Curriculum
 from ..imagination.goal_predictor import GoalPredictor
+from ..imagination.predictor_files import without_module
 from ..object_stage.networks import FILE as OBJECT_FILE
 from ..object_stage.networks import ObjectNetworks
 from ..object_stage.sldr import reads_object_networks
@@ -403,7 +404,7 @@ class FollowObject:
         check_names(environment, _OF_AN_ENVIRONMENT, "load()")
         if environment and not made_by_function(env_id):
             other = known_id(environment.pop("env_id", env_id))
-            if environment or other != known_id(env_id):
+            if environment or without_module(other) != without_module(env_id):
                 raise ValueError(f"{folder} is of {env_id}; load() can make it of no other one")
         elif environment:
             registered(**environment, named=env_id)

@@ -112,6 +112,7 @@ def run_config(
     imagine = WRAPPER in _named(entry, "env_wrapper", path)
     of_runs = _of_runs(entries, path)
     settings = of_runs | _flattened(entry, path)
+    unknown = env_id not in IDS and not {env_id, env_id.rpartition(":")[2]} & entries.keys()
     has_object_stage = imagine or _auxiliary_name(settings) == "sldr"
     if has_object_stage and env_id not in IDS:
         if _auxiliary_name(settings) == "sldr":
@@ -120,7 +121,7 @@ def run_config(
                 "can read the object's state from; train it with --method fo or her"
             )
         check_followable(env_id)
-        if env_id not in entries:  # set up as the package's most similar task
+        if unknown:  # set up as the package's most similar task
             if surface_choices(env_id)[0]:
                 settings = of_runs | _flattened(_entry(entries, SIMILAR[True], path), path)
             _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
@@ -128,7 +129,7 @@ def run_config(
     if has_object_stage and _find(entries, of_object) is not None:
         settings |= _object_stage(_entry(entries, of_object, path), path)
     ours = file is None and preset == "default"  # the paper's cycles are the paper's
-    if ours and env_id not in IDS and env_id not in entries:
+    if ours and unknown:
         _fit_to_horizon(settings, env_id)
     changes: dict[str, Any] = {}
     for name, value in (overrides or {}).items():

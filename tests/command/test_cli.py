@@ -121,6 +121,15 @@ def test_evaluation_is_a_table_of_a_line_in_eighty_columns(
     assert out.splitlines()[-1].startswith("reached at any step: ")
 
 
+def test_task_named_with_its_module_is_no_other_task(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    same = f"sb3_follow_object:{TASK}"
+    status, out, _ = run(capsys, "evaluate", finished, "--episodes", 2, "--json", "--env", same)
+    assert status == 0 and "reached_rate" in json.loads(out)
+    assert not (finished / "cross_tests.json").exists()
+
+
 def test_policy_and_config_alone_can_be_evaluated(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

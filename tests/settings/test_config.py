@@ -398,3 +398,8 @@ def test_settings_of_all_tasks_that_rl_zoo3_does_not_know_have_an_entry_of_their
         file.write_text(yaml.safe_dump({**entries, OF_RUNS: given}))
         with pytest.raises(ValueError, match=sentence):
             run_config(TASK, file=file)
+
+
+def test_a_module_before_an_id_changes_no_setting() -> None:
+    whole = run_config("gymnasium_robotics:FetchPush-v4")
+    assert whole.settings == run_config("FetchPush-v4").settings
