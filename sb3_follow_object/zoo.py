@@ -139,7 +139,7 @@ def _check(arguments: Sequence[str]) -> argparse.Namespace:
     """Read the options that rl_zoo3 would pass over or answer with a traceback.
 
     Raises:
-        ValueError: one of them cannot be meant.
+        ValueError: one of them is invalid.
     """
     store_dict = need("rl_zoo3.utils", "zoo").StoreDict
     parser = argparse.ArgumentParser(PROGRAM, add_help=False, allow_abbrev=False)

@@ -38,7 +38,7 @@ class ReachCallback(CopyableCallback):
         own_success: the same of all others.
 
     Raises:
-        ValueError: a setting that cannot be meant; or training starts in an environment without
+        ValueError: an invalid setting; or training starts in an environment without
             ReachFirstVecEnv or ReachFirstWrapper, or with another replay buffer than
             FollowObjectReplayBuffer.
     """

@@ -1,4 +1,4 @@
-"""What the arguments of several commands mean, and what of them cannot be meant together."""
+"""What the arguments of several commands mean, and which of them exclude each other."""
 
 from __future__ import annotations
 

@@ -286,7 +286,7 @@ def _compare(args: argparse.Namespace) -> None:
     check_agreed("steps", args.steps, overrides)
     settings = Settings(args.steps, args.preset, overrides, args.paper_evaluation)
     grid = (args.out, args.tasks, args.methods, args.seeds, settings)
-    n_runs = len(plan(*grid))  # what cannot be meant is refused before a cluster is asked for
+    n_runs = len(plan(*grid))  # what is invalid is refused before a cluster is asked for
     executor: Executor
     if args.ray is None:
         jobs, threads = share_cores(cores(), n_runs, args.jobs, args.threads)

@@ -216,7 +216,7 @@ class FollowObject:
                 make_env, object, goal, is_success, effector, lift.
 
         Raises:
-            ValueError: an id, a key or a value that cannot be meant, with the nearest that can; or
+            ValueError: an invalid id, key or value, with the nearest valid one; or
                 a setting among the arguments, or one of a run folder, such as n_timesteps.
         """
         _check_places(arguments, overrides or {})

@@ -291,4 +291,4 @@ def _check_shape(shape: Any) -> None:
     if type(shape["n_critics"]) is not int or not 1 <= shape["n_critics"] <= CRITICS_LIMIT:
         raise ValueError(f"n_critics is {shape['n_critics']!r}")
     if type(shape["layer_norm"]) is not bool or not float(shape["clip"]) > 0.0:
-        raise ValueError("layer_norm or clip cannot be meant")
+        raise ValueError("layer_norm or clip is invalid")

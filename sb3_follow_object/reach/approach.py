@@ -164,11 +164,11 @@ def reach_first_settings(
 
     Args:
         given: to the wrapper, by their names.
-        who: beginning of the sentence about what cannot be meant.
+        who: beginning of the sentence about what is invalid.
         spec: of the environment, which says whether its objects are pushed; None says no.
 
     Raises:
-        ValueError: a setting that cannot be meant, or no part of the robot is told.
+        ValueError: an invalid setting, or no part of the robot is told.
     """
     if spec is not None and spec.id not in IDS and spec.id in gym.registry:
         given = {"max_steps": steps_to_reach(spec.id), **given}

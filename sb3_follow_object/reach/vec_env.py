@@ -43,7 +43,7 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
         settings: of `ReachFirstSettings`; the standoff "auto" is that of a task of this package.
 
     Raises:
-        ValueError: a setting that cannot be meant, or the observations do not hold the effector
+        ValueError: an invalid setting, or the observations do not hold the effector
             where the settings say, in metres.
     """
 

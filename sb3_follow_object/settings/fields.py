@@ -24,7 +24,7 @@ from pydantic.fields import FieldInfo
 from ..common.numbers import as_flag, as_number, as_whole, shown
 from ..common.suggestions import did_you_mean
 
-LARGEST = 10**15  # of whole numbers: what is more cannot be meant
+LARGEST = 10**15  # of whole numbers: more is a mistake
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Said:
 
 
 class Unfit(ValueError):
-    """Raised by what reads a value with parts: its sentence says which of them cannot be meant."""
+    """Raised by what reads a value with parts: its sentence says which of them is invalid."""
 
 
 Whole = Annotated[int, BeforeValidator(as_whole), Said("a whole number")]
@@ -127,7 +127,7 @@ class Setting:
 
         Args:
             value: given for it.
-            where: beginning of the sentence about one that cannot be meant.
+            where: beginning of the sentence about one that is invalid.
             data: as in `checked`.
 
         Raises:
@@ -173,7 +173,7 @@ class Group:
 
     Attributes:
         title: what tables call the group.
-        where: beginning of a sentence about an instance's value that cannot be meant.
+        where: beginning of a sentence about an instance's value that is invalid.
         of_name: what a sentence about data adds to the name of the mapping.
     """
 
@@ -265,12 +265,12 @@ def checked(
     Args:
         group: whose settings they are.
         given: by their names.
-        where: beginning of the sentence about what cannot be meant.
+        where: beginning of the sentence about what is invalid.
         without: those of the group's that may not be given.
         data: refuse what only Python code can give.
 
     Raises:
-        ValueError: an unknown name, with the nearest known one, or a value that cannot be meant.
+        ValueError: an unknown name, with the nearest known one, or an invalid value.
     """
     group = group.of(given)
     if group is Anything:

@@ -92,7 +92,7 @@ def run_config(
         overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win.
 
     Raises:
-        ValueError: an id, a file, a key or a value that cannot be meant, with the nearest that can.
+        ValueError: an invalid id, file, key or value, with the nearest valid one.
     """
     name = check_task(env_id)
     module = env_id.rpartition(":")[0] if name in IDS and name not in BUILT_IN else ""
@@ -349,7 +349,7 @@ def _object_stage(entry: dict[str, Any], path: Path) -> dict[str, Any]:
 def _scale_distances(settings: dict[str, Any], factor: float) -> None:
     """Fit what presets say in metres to how near its goal an object must be.
 
-    What cannot be meant is left to be refused as it was given.
+    What is invalid is left to be refused as it was given.
     """
     for outer, name in _TOLERANCES:
         group = settings.get(outer)

@@ -128,7 +128,7 @@ def part_of_reach(
     Args:
         part: whose settings they are.
         given: by their names.
-        who: beginning of the sentence about what cannot be meant.
+        who: beginning of the sentence about what is invalid.
 
     Raises:
         ValueError: an unknown name, one that is the other's to have, or a value that cannot be
