@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,28 @@ class ObjectPaths:
     env_steps: int
 
 
+@dataclass(frozen=True)
+class ObjectProgress:
+    """What of the object's stage lies before, or decides about, the training that runs.
+
+    Attributes:
+        trial: number of the surface choice that is tried, from 0.
+        spent: env steps of earlier trials.
+        paths: env steps of paths that showed its ways to be too rough.
+        until: env steps up to which it then learns on; None, it does not.
+    """
+
+    trial: int = 0
+    spent: int = 0
+    paths: int = 0
+    until: int | None = None
+
+    @property
+    def earlier_steps(self) -> int:
+        """Env steps besides those of the training that runs."""
+        return self.spent + self.paths
+
+
 class StopWhenSolved(CopyableCallback):
     """Tests the policy without noise now and then and stops once it succeeds often enough.
 
@@ -47,6 +69,7 @@ class StopWhenSolved(CopyableCallback):
             `train_freq` says otherwise.
         success_rate: in [0, 1]; two tests in a row must reach it, so that luck does not stop early.
         report: called with (env_steps, success rate) after each test.
+        progress: of the stage so far; is kept with the training's state.
     """
 
     def __init__(
@@ -56,6 +79,7 @@ class StopWhenSolved(CopyableCallback):
         every_episodes: int = StageSettings.object_test_every,
         success_rate: float = StageSettings.object_success,
         report: Callable[[int, float], None] | None = None,
+        progress: ObjectProgress | None = None,
     ):
         super().__init__()
         self.test_env = test_env
@@ -67,7 +91,7 @@ class StopWhenSolved(CopyableCallback):
         self.test_steps = 0
         self.stopped = False
         self._rollouts = 0
-        self.notes: dict[str, Any] = {}  # of whoever trains, kept with the state
+        self.progress = progress or ObjectProgress()
 
     def _on_rollout_end(self) -> None:
         self._rollouts += 1
@@ -94,15 +118,15 @@ class StopWhenSolved(CopyableCallback):
     @property
     def learns_on(self) -> bool:
         """Whether it was told to go on once though the task was solved."""
-        return "until" in self.notes
+        return self.progress.until is not None
 
     def learn_on(self, until: int) -> None:
         """Go on for so many env steps in all, and to the next two tests that reach the rate."""
-        self.notes = {**self.notes, "until": until}
+        self.progress = replace(self.progress, until=until)
         self.stopped = False
 
     def _on_step(self) -> bool:
-        self.stopped = self.solved and self.model.num_timesteps >= self.notes.get("until", 0)
+        self.stopped = self.solved and self.model.num_timesteps >= (self.progress.until or 0)
         return not self.stopped
 
     def state_dict(self) -> dict[str, Any]:
@@ -119,7 +143,7 @@ class StopWhenSolved(CopyableCallback):
             "test_steps": self.test_steps,
             "stopped": self.stopped,
             "rollouts": self._rollouts,
-            **({"notes": self.notes} if self.notes else {}),
+            "notes": {name: note for name, note in asdict(self.progress).items() if note},
         }
 
     def load_state_dict(self, state: dict[str, Any], model: HerDDPG, env: VecEnv) -> None:
@@ -133,7 +157,7 @@ class StopWhenSolved(CopyableCallback):
         self.rates = list(state["rates"])
         self.test_steps, self.stopped = state["test_steps"], state["stopped"]
         self._rollouts = state["rollouts"]
-        self.notes = dict(state.get("notes", {}))
+        self.progress = ObjectProgress(**state.get("notes", {}))
 
 
 def train_object_policy(
@@ -148,6 +172,7 @@ def train_object_policy(
     seed: int | None = None,
     report: Callable[[int, float], None] | None = None,
     callback: Callable[[StopWhenSolved], BaseCallback] | None = None,
+    progress: ObjectProgress | None = None,
     state: dict[str, Any] | None = None,
     too_rough: Callable[[HerDDPG, StopWhenSolved], bool] | None = None,
     **algorithm_kwargs: Any,
@@ -165,14 +190,15 @@ def train_object_policy(
         seed: of networks, noise and replay.
         report: called with (env_steps, success rate) after each test.
         callback: makes another callback from the one that tests.
-        state: of `StopWhenSolved.state_dict`; training goes on exactly from there.
+        progress: of the stage before this training.
+        state: of `StopWhenSolved.state_dict`, progress among it; it goes on exactly from there.
         too_rough: asked once, when the task is solved, whether to learn for as many steps again.
         algorithm_kwargs: of HerDDPG.
 
     Returns:
         The algorithm and the callback that knows the test results.
     """
-    solved = StopWhenSolved(test_env, n_test_episodes, test_every, success_rate, report)
+    solved = StopWhenSolved(test_env, n_test_episodes, test_every, success_rate, report, progress)
     model = HerDDPG("MultiInputPolicy", env, seed=seed, **algorithm_kwargs)
     if state is not None:
         solved.load_state_dict(state, model, env)

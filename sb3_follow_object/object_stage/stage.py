@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..any_task.tasks import (
@@ -23,11 +24,7 @@ from ..ddpg.her_ddpg import HerDDPG
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.predictor_files import without_module
 from .networks import ObjectNetworks
-from .policy import (
-    StopWhenSolved,
-    collect_paths,
-    train_object_policy,
-)
+from .policy import ObjectProgress, StopWhenSolved, collect_paths, train_object_policy
 
 
 class ObjectStage:
@@ -161,7 +158,7 @@ class ObjectStage:
             if float(np.mean(made.error_mm)) <= 1000.0 * self.settings["object_error"]:
                 return False
             made = None
-            solved.notes = {**solved.notes, "paths": path_steps}
+            solved.progress = replace(solved.progress, paths=path_steps)
             steps = min(2 * model.num_timesteps, self.settings["object_timesteps"])
             self.report(f"  its ways are too rough: the object learns on, for {steps} steps in all")
             return True
@@ -176,8 +173,7 @@ class ObjectStage:
 
     def _count(self, model: HerDDPG, solved: StopWhenSolved) -> None:
         """Note what the policy has cost, and what its last test came to."""
-        earlier = solved.notes.get("spent", 0) + solved.notes.get("paths", 0)
-        self.steps = self.policy_steps = earlier + model.num_timesteps
+        self.steps = self.policy_steps = solved.progress.earlier_steps + model.num_timesteps
         self.success = solved.rates[-1] if solved.rates else float("nan")
 
     def _predict(
@@ -242,19 +238,10 @@ class ObjectStage:
         settings, choices = self.settings, self._choices()
         if settings["object_timesteps"] <= SURFACE_STEPS:
             choices = choices[:1]  # too few to tell
-        notes = {} if state is None else state.get("notes", {})
-        spent: int = notes.get("spent", 0)
-        for trial in range(notes.get("trial", 0), len(choices)):
-            self.on_table = choices[trial]
-            last = trial == len(choices) - 1
-
-            def noting(
-                solved: StopWhenSolved, trial: int = trial, spent: int = spent
-            ) -> BaseCallback:
-                if trial:
-                    solved.notes = {**solved.notes, "trial": trial, "spent": spent}
-                return CallbackList([]) if callback is None else callback(solved)
-
+        progress = ObjectProgress(**(state or {}).get("notes", {}))
+        while True:
+            self.on_table = choices[progress.trial]
+            last = progress.trial == len(choices) - 1
             env, test_env = (self._env(name) for name in ("object", "object_test"))
             model, solved = train_object_policy(
                 env,
@@ -266,7 +253,8 @@ class ObjectStage:
                 success_rate=settings["object_success"],
                 seed=stream_seed(self.seed, "object"),
                 report=lambda steps, rate: self.report(f"  {steps:>7} steps: success {rate:.2f}"),
-                callback=noting,
+                callback=callback,
+                progress=progress,
                 state=state,
                 too_rough=too_rough,
                 **settings["object_algorithm"],
@@ -275,10 +263,10 @@ class ObjectStage:
             test_env.close()
             # What learned on, as its ways were rough, was solved, whatever its last tests say.
             if solved.solved or solved.learns_on or last:
-                break
-            spent, state = spent + model.num_timesteps, None
+                return model, solved
+            progress = ObjectProgress(progress.trial + 1, progress.spent + model.num_timesteps)
+            state = None
             self.report("  it does not learn on its surface: it may leave it from here on")
-        return model, solved
 
     def _env(self, purpose: str) -> VecEnv:
         env = object_vec_env(

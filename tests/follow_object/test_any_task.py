@@ -25,6 +25,7 @@ from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.imagination.predictor_files import FACTS_FILE
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
 from sb3_follow_object.object_stage import stage as stages
+from sb3_follow_object.object_stage.policy import ObjectProgress
 from sb3_follow_object.reach.wrapper import ReachFirstWrapper
 from sb3_follow_object.runs import predictor_cache
 from sb3_follow_object.settings.presets import run_config
@@ -203,7 +204,7 @@ def test_an_object_that_learned_on_is_kept_whatever_its_last_tests_say(
 ) -> None:
     def learned_on(*args: Any, **kwargs: Any) -> Any:
         model, solved = train(*args, **kwargs)
-        solved.rates, solved.notes = [1.0, 1.0, 0.5], {"until": model.num_timesteps}
+        solved.rates, solved.progress = [1.0, 1.0, 0.5], ObjectProgress(until=model.num_timesteps)
         return model, solved
 
     train = stages.train_object_policy
