@@ -21,7 +21,7 @@ from ..replay.following import end_running_episodes, episodes_are_whole, follow_
 from ..settings.stages import CurriculumTestSettings
 from .copyable import CopyableCallback
 from .env_copies import copies_for_tests
-from .rollout import Observation, OnStep, noise_free, run_episodes
+from .rollout import Observation, OnStep, check_hears_rollouts, noise_free, run_episodes
 
 _ASKER = "CurriculumCallback"
 
@@ -118,6 +118,7 @@ class CurriculumCallback(CopyableCallback):
         self._episode_ended = bool(state["episode_ended"])
 
     def _on_training_start(self) -> None:
+        check_hears_rollouts(self)
         self._follow_training_env()
         broken_off = self._is_training and self.model.num_timesteps > 0
         # Who knows what step the environment stands at after an exception? Ours do.

@@ -16,7 +16,7 @@ from ..common.numbers import checked_number, checked_whole
 from ..common.seeds import stream_seed
 from .copyable import CopyableCallback
 from .curriculum_callback import CurriculumCallback
-from .rollout import noise_free, run_episodes
+from .rollout import check_hears_rollouts, noise_free, run_episodes
 
 
 class OriginalGoalEvalCallback(CopyableCallback):
@@ -73,6 +73,10 @@ class OriginalGoalEvalCallback(CopyableCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
+        if not isinstance(eval_env, VecEnv):
+            raise ValueError(
+                f"eval_env is a {type(eval_env).__name__}; give a VecEnv, such as make_vec makes"
+            )
         if is_vecenv_wrapped(eval_env, VecNormalize):
             raise ValueError(
                 "eval_env is in VecNormalize; the model's own normalises already: leave it out."
@@ -149,6 +153,7 @@ class OriginalGoalEvalCallback(CopyableCallback):
         self._resumed = False  # what `learn` begins next may count anew
 
     def _on_training_start(self) -> None:
+        check_hears_rollouts(self)
         self._wall_before, self._started = self.wall_s, time.monotonic()
         if not self._resumed and self.model.num_timesteps < self._last_steps:
             self._last_steps = 0  # of another model, or SB3 counts its steps anew

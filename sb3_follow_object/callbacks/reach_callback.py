@@ -13,6 +13,7 @@ from ..reach.vec_env import ReachFirstVecEnv
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
 from ..settings.stages import ReachTeachingSettings, part_of_reach
 from .copyable import CopyableCallback
+from .rollout import check_hears_rollouts
 
 _SMOOTHING = 0.1  # weight of a rollout's rate in the running ones
 _LEAST_SHARE = 0.02  # below it nobody reaches first any more
@@ -65,6 +66,7 @@ class ReachCallback(CopyableCallback):
         return max(1, round(self.settings.n_updates * (1.0 - self.success)))
 
     def _on_training_start(self) -> None:
+        check_hears_rollouts(self)
         if not self._is_wrapped():
             raise ValueError(
                 "ReachCallback needs an environment wrapped in ReachFirstVecEnv or "

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..common.answers import check_shape, one_each, one_number
@@ -20,6 +21,18 @@ Policy = Callable[[Observation], np.ndarray]
 OnStep = Callable[
     [Observation, np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]], Observation], None
 ]
+
+
+def check_hears_rollouts(callback: BaseCallback) -> None:
+    """Raise a ValueError where another callback stands between a callback and the rollouts' ends.
+
+    SB3's event callbacks, such as EveryNTimesteps, pass on steps and nothing else.
+    """
+    if callback.parent is not None:
+        raise ValueError(
+            f"{type(callback).__name__} works at the end of rollouts, of which "
+            f"{type(callback.parent).__name__} tells it nothing: put it beside that, in a list"
+        )
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,15 @@ def save_actor(path: str | os.PathLike[str], actor: Actor, env_id: str) -> None:
         env_id: the task that it was trained for.
 
     Raises:
-        ValueError: the actor's activation function is none that a file can name.
+        ValueError: it is no actor of a `HerPolicy`, or has an activation function that a file
+            cannot name.
     """
-    extractor = actor.features_extractor
-    assert isinstance(extractor, NormalizedGoalExtractor)
+    extractor = getattr(actor, "features_extractor", None)
+    if not isinstance(extractor, NormalizedGoalExtractor):
+        raise ValueError(
+            "save_actor takes the actor of a HerPolicy, e.g. model.policy.actor_average, not "
+            f"{type(actor).__name__}"
+        )
     folding = extractor.folding
     activation = actor.activation_fn.__name__
     if _ACTIVATIONS.get(activation) is not actor.activation_fn:

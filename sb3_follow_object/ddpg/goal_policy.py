@@ -45,6 +45,9 @@ class GoalPolicy(WholeModule, MultiInputPolicy):
         target_clip: tuple[float, float] | None = GoalPolicySettings.target_clip,
         **kwargs: Any,
     ):
+        for name, whose in (("use_sde", "DDPG's and TD3's"), ("mirrors", "without mirrors")):
+            if name in kwargs:
+                raise ValueError(f"GoalPolicy is {whose}: leave {name} out")
         settings = GoalPolicySettings(action_l2=action_l2, target_clip=target_clip)
         self.action_l2 = settings.action_l2
         self.target_clip = settings.target_clip

@@ -223,11 +223,18 @@ class HerDDPG(KeptDDPG):
             self.policy_kwargs["mirrors"] = [mirror.plain() for mirror in mirrors]
             warn_of_other_planes(mirrors, self.env)
         super()._setup_model()
-        with_steps = isinstance(self.replay_buffer, FollowObjectReplayBuffer | None)
-        if self.hindsight_bound and not with_steps:
+        if not isinstance(self.policy, HerPolicy):
             raise ValueError(
-                "hindsight_bound needs a FollowObjectReplayBuffer, which knows how soon an episode "
-                f"reached each goal; {type(self.replay_buffer).__name__} does not"
+                f"HerDDPG wants a HerPolicy, not {type(self.policy).__name__}; GoalPolicy is for "
+                "DDPG and TD3"
+            )
+        self.policy.averages = True
+        without_steps = self.replay_buffer is not None and _samples_otherwise(self.replay_buffer)
+        if self.hindsight_bound and without_steps:
+            raise ValueError(
+                "hindsight_bound needs a FollowObjectReplayBuffer, whose sample_with_steps knows "
+                f"how soon an episode reached each goal; {type(self.replay_buffer).__name__} has "
+                "another sample"
             )
         self.rng = np.random.default_rng(np.random.randint(2**31))
         if not hasattr(self, "moments"):  # SB3's load() brings them before it comes here
@@ -402,7 +409,7 @@ class HerDDPG(KeptDDPG):
         """Draw n transitions for so many batches, and (n, 1) steps until each goal was reached."""
         buffer = self.replay_buffer
         assert buffer is not None
-        if isinstance(buffer, FollowObjectReplayBuffer):
+        if isinstance(buffer, FollowObjectReplayBuffer) and not _samples_otherwise(buffer):
             if self._device_replay is not None:
                 return self._device_replay.sample_with_steps(n)
             return buffer.sample_with_steps(n, n_batches=n_batches)
@@ -416,3 +423,8 @@ class HerDDPG(KeptDDPG):
             live += self.auxiliary_critic.q_networks.parameters()
             target += self.auxiliary_critic.target_networks.parameters()
         return live, target
+
+
+def _samples_otherwise(buffer: ReplayBuffer) -> bool:
+    """Whether a buffer's batches come from a `sample` that knows nothing of steps to goals."""
+    return not isinstance(buffer, FollowObjectReplayBuffer) or buffer.samples_otherwise()

@@ -35,7 +35,7 @@ class LayerNormReLU(nn.Module):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """Standardise each row of (n, width) and cut off what is below its mean."""
-        return th.relu(nn.functional.layer_norm(x, x.shape[-1:]))
+        return th.relu(nn.functional.layer_norm(x, (int(x.shape[-1]),)))
 
 
 class _LayerNorm(th.autograd.Function):

@@ -47,10 +47,11 @@ def export_onnx(model: Any, path: str | os.PathLike[str]) -> float:
         ValueError: the model has no policy yet, or one that cannot be written as ONNX.
     """
     onnx, runtime = need("onnx", _EXTRA), need("onnxruntime", _EXTRA)
-    policy = copy.deepcopy(_policy_of(model)).to("cpu")
-    policy.set_training_mode(False)
+    policy = _policy_of(model)
     names = _inputs(policy.observation_space)
     try:
+        policy = copy.deepcopy(policy).to("cpu")
+        policy.set_training_mode(False)
         content = _traced(policy, names, onnx)
     except Exception as error:  # PyTorch's exporter and onnx raise errors of many kinds
         first = str(error).strip().splitlines()[:1] or [type(error).__name__]

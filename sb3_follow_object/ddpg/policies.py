@@ -144,7 +144,13 @@ class HerPolicy(WholeModule, TD3Policy):
             networks see every state on one side of them. Beyond the paper.
 
     The other arguments are TD3Policy's.
+
+    Raises:
+        ValueError: an invalid argument; or, by `predict`, another algorithm than `HerDDPG` has
+            trained it, which does not move the averaged actor.
     """
+
+    averages = False  # whether its algorithm moves the averaged actor
 
     def __init__(
         self,
@@ -195,11 +201,17 @@ class HerPolicy(WholeModule, TD3Policy):
         self.actor_average.set_training_mode(False)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        if self.actor.optimizer.state and not self.averages:
+            raise ValueError(
+                "HerPolicy is HerDDPG's alone, which moves the averaged actor that it plays; for "
+                "DDPG and TD3 take GoalPolicy"
+            )
         return self.actor_average(observation)
 
     @th.no_grad()
     def update_average(self, decay: float) -> None:
         """Move the averaged actor towards the actor, keeping the share `decay` in [0, 1] of it."""
+        self.averages = True
         average: list[th.Tensor] = [*self.actor_average.parameters()]
         live: list[th.Tensor] = [*self.actor.parameters()]
         if decay == 0.0:  # exactly, to the last bit

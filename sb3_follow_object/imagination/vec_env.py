@@ -75,6 +75,11 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
                 "ImaginedGoalVecEnv needs goals in metres: put it inside VecNormalize, not around "
                 "it"
             )
+        if not isinstance(venv, VecEnv):
+            raise ValueError(
+                f"ImaginedGoalVecEnv takes a VecEnv, not {type(venv).__name__}; around a single "
+                "environment put ImaginedGoalWrapper"
+            )
         if not isinstance(predictor, GoalPredictor) or not isinstance(curriculum, Curriculum):
             raise ValueError(
                 "ImaginedGoalVecEnv takes a GoalPredictor (get_predictor makes one) and a "
@@ -166,6 +171,18 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
         if attr_name in SHARED:
             return [getattr(self, attr_name) for _ in self._get_indices(indices)]
         return super().get_attr(attr_name, indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of the copies.
+
+        Raises:
+            ValueError: it is the predictor or the curriculum, which all copies share.
+        """
+        if attr_name in SHARED:
+            raise ValueError(
+                f"{attr_name} is shared by all copies: make another ImaginedGoalVecEnv with it"
+            )
+        super().set_attr(attr_name, value, indices)
 
     def get_state(self) -> dict[str, Any]:
         """Return the goals, the generator's state and, where it offers one, the inner state.

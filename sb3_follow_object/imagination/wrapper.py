@@ -17,6 +17,7 @@ from ..any_task.context import read_context
 from ..any_task.tasks import steps_of_object
 from ..common.answers import check_shape, one_number
 from ..common.copies import WholeCopies
+from ..common.numbers import shown
 from ..common.providers import provider
 from ..envs import IDS, physics_id
 from ..envs.robot_copies import with_face
@@ -75,6 +76,11 @@ class ImaginedGoalWrapper(
         predictor: GoalPredictor | str | os.PathLike[str] = AUTO,
         curriculum: Curriculum | Mapping[str, Any] | None = None,
     ) -> None:
+        if not isinstance(predictor, (GoalPredictor, str, os.PathLike)):
+            raise ValueError(
+                "predictor must be a GoalPredictor, the folder of one or 'auto', not "
+                f"{shown(predictor)}"
+            )
         env = with_face(env)
         super().__init__(env)
         self._space, self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)

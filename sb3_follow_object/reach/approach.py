@@ -116,7 +116,11 @@ class Approach:
         late = (self._leg == ABOVE) & (2 * self._steps >= self.settings.max_steps)
         self._leg += (near & ~arrived) | late
         self.reaching &= ~arrived & (self._steps < self.settings.max_steps)
-        np.add.at(self.counts, (self.began[dones].astype(int), self.came[dones].astype(int)), 1)
+        self.count(dones)
+
+    def count(self, ended: np.ndarray) -> None:
+        """Count episodes that have ended, a mask (n,) of the copies."""
+        np.add.at(self.counts, (self.began[ended].astype(int), self.came[ended].astype(int)), 1)
 
     def _target(self) -> np.ndarray:
         target = self._place.copy()

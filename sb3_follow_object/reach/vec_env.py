@@ -48,6 +48,11 @@ class ReachFirstVecEnv(CopyableVecEnvWrapper):
     """
 
     def __init__(self, venv: VecEnv, **settings: Any) -> None:
+        if not isinstance(venv, VecEnv):
+            raise ValueError(
+                f"ReachFirstVecEnv takes a VecEnv, not {type(venv).__name__}; around a single "
+                "environment put ReachFirstWrapper"
+            )
         super().__init__(venv)
         spec = venv.get_attr("spec", indices=[0])[0] if venv.has_attr("spec") else None
         reach = reach_first_settings(settings, type(self).__name__, spec)

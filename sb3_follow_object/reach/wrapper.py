@@ -51,6 +51,7 @@ class ReachFirstWrapper(
         check_reachable(env.observation_space, env.action_space, reach)
         self.approach = Approach(1, cast(spaces.Box, env.action_space), reach)
         self._obs: Observation = {}
+        self._is_running = False  # an episode, as far as the environment inside says
 
     def set_reach(self, actor: ReachActor, share: float) -> None:
         """Reach with this policy from now on, in this share of the episodes that begin."""
@@ -71,6 +72,9 @@ class ReachFirstWrapper(
         """Start an episode, perhaps with reaching."""
         if seed is not None:
             self.approach.rng = np.random.default_rng([seed, STREAM])
+        if self._is_running:  # a wrapper around this one, such as TimeLimit, has ended it
+            self.approach.count(np.array([True]))
+        self._is_running = False
         obs, info = self.env.reset(seed=seed, options=options)
         self._obs = _batch_of_one(obs)
         ahead = self._obs["desired_goal"]
@@ -86,6 +90,7 @@ class ReachFirstWrapper(
         self._obs = _batch_of_one(obs)
         ended = terminated or truncated
         self.approach.arrive(self._obs, np.array([ended]))
+        self._is_running = not ended
         info = {**info, GIVEN: action, EXECUTED: executed, **({LAST: obs} if ended else {})}
         return obs, float(reward), terminated, truncated, info
 

@@ -151,6 +151,7 @@ class DeviceReplay(WholeCopies):
             "cher": buffer.selection is not None,
             "reward_function": buffer.reward_function is not None,
             "copy_info_dict": buffer.copy_info_dict,
+            "sample of a subclass": buffer.samples_otherwise(),
             "observations that are not vectors of floats": buffer.achieved is None
             or not keys <= stored,
             "actions that are not floats": "actions" not in stored,

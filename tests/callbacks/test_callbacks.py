@@ -12,7 +12,7 @@ import pytest
 import toy
 from imagined import N, bare, imagining, learner
 from stable_baselines3 import DDPG, SAC, TD3
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
@@ -251,6 +251,24 @@ def test_the_curriculum_callback_resumes() -> None:
 def test_bad_counts_are_refused(options: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         CurriculumCallback(imagining(toy.curriculum(), "test"), **{"n_episodes": 1, **options})
+
+
+@pytest.mark.parametrize("kind", ["curriculum", "eval"])
+def test_event_callbacks_are_refused_that_tell_nothing_of_rollouts(kind: str) -> None:
+    env = imagining(toy.curriculum())
+    callback: BaseCallback = (
+        CurriculumCallback(n_episodes=N)
+        if kind == "curriculum"
+        else OriginalGoalEvalCallback(bare(), N, 10)
+    )
+    with pytest.raises(ValueError, match="of which EveryNTimesteps tells it nothing"):
+        learner(env).learn(10, callback=EveryNTimesteps(5, callback))
+
+
+def test_an_eval_env_is_a_vectorised_one() -> None:
+    single: Any = toy.PointEnv()
+    with pytest.raises(ValueError, match="eval_env is a PointEnv; give a VecEnv"):
+        OriginalGoalEvalCallback(single, N, 10)
 
 
 def test_a_test_env_must_show_h_max() -> None:

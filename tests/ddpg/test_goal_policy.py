@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import DDPG, TD3
+from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from tiny import TASK
 
-from sb3_follow_object import FollowObjectReplayBuffer, GoalPolicy
+from sb3_follow_object import FollowObjectReplayBuffer, GoalPolicy, HerDDPG, HerPolicy
 from sb3_follow_object.ddpg.layer_norm import LayerNorm
 from sb3_follow_object.envs import make_vec
 
@@ -120,8 +120,21 @@ def test_a_saved_model_keeps_its_settings(algorithm: type[Any], tmp_path: Path) 
         ({"action_l2": -1.0}, "action_l2 is -1.0; it must lie in [0, inf)"),
         ({"target_clip": (0.0, -50.0)}, "must be (low, high) with low <= high or None, not (0.0"),
         ({"target_clip": "auto"}, "must be (low, high) with low <= high or None, not 'auto'"),
+        ({"mirrors": "auto"}, "GoalPolicy is without mirrors: leave mirrors out"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(settings: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=re.escape(sentence)):
         policy(**settings)
+
+
+def test_each_policy_is_refused_by_algorithms_that_it_is_not_for() -> None:
+    env = make_vec(TASK, 1, 1)
+    with pytest.raises(ValueError, match="GoalPolicy is DDPG's and TD3's: leave use_sde out"):
+        SAC(GoalPolicy, env, buffer_size=100)
+    with pytest.raises(ValueError, match="HerDDPG wants a HerPolicy, not GoalPolicy"):
+        HerDDPG(GoalPolicy, env, buffer_size=100)  # type: ignore[arg-type]
+    model = DDPG(HerPolicy, env, buffer_size=1000, learning_starts=100, batch_size=8)
+    model.predict(env.reset())  # nothing is learned yet
+    with pytest.raises(ValueError, match="HerPolicy is HerDDPG's alone"):
+        model.learn(200)

@@ -18,6 +18,7 @@ from sb3_follow_object.callbacks.rollout import run_episodes
 from sb3_follow_object.ddpg.actor_files import load_actor, save_actor
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import make_vec
+from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
 
 
 @pytest.mark.parametrize("layer_norm", [False, True])
@@ -426,3 +427,21 @@ def test_other_optimisers_and_observations_of_more_dimensions() -> None:
     model = HerDDPG("MultiInputPolicy", env, **{**TINY, "policy_kwargs": policy_kwargs})
     model.learn(100, log_interval=None)  # type: ignore[arg-type]
     assert isinstance(model.actor.optimizer, th.optim.RMSprop)
+
+
+class Counting(FollowObjectReplayBuffer):
+    """Draws as ever, and counts."""
+
+    drawn = 0
+
+    def sample(self, *args: Any, **kwargs: Any) -> Any:
+        self.drawn += 1
+        return super().sample(*args, **kwargs)
+
+
+def test_the_sample_of_a_subclass_is_asked() -> None:
+    model = make_model(replay_buffer_class=Counting)
+    model.learn(200, log_interval=None)  # type: ignore[arg-type]
+    assert isinstance(model.replay_buffer, Counting) and model.replay_buffer.drawn > 0
+    with pytest.raises(ValueError, match="Counting has another sample"):
+        make_model(replay_buffer_class=Counting, hindsight_bound=True)

@@ -12,10 +12,11 @@ import pytest
 import torch as th
 import toy
 from gymnasium import spaces
+from sb3_contrib import TQC
 from small_models import make_model
 from stable_baselines3 import DQN, PPO, SAC, TD3
 
-from sb3_follow_object import HerDDPG, load_actor, make_vec, save_actor
+from sb3_follow_object import HerDDPG, LayerNormReLU, load_actor, make_vec, save_actor
 from sb3_follow_object.ddpg import onnx_files
 from sb3_follow_object.ddpg.onnx_files import export_onnx
 
@@ -84,6 +85,20 @@ def test_stock_algorithms_on_goal_environments(algorithm: type, tmp_path: Path) 
     small = {} if algorithm is PPO else {"buffer_size": 100}
     model = algorithm("MultiInputPolicy", make_vec(TASK, 1, 1), **tiny(), **small)
     assert export_onnx(model, tmp_path / "policy.onnx") <= 1e-5
+
+
+@pytest.mark.parametrize("algorithm", [SAC, TQC])
+def test_networks_with_our_activation_are_written(algorithm: Any, tmp_path: Path) -> None:
+    networks = {"net_arch": [8], "activation_fn": LayerNormReLU}
+    env = make_vec(TASK, 1, 1)
+    model = algorithm("MultiInputPolicy", env, policy_kwargs=networks, buffer_size=100)
+    assert export_onnx(model, tmp_path / "policy.onnx") <= 1e-5
+
+
+def test_a_policy_that_cannot_be_copied_is_refused(tmp_path: Path) -> None:
+    model = PPO("MultiInputPolicy", toy.PointEnv(), use_sde=True, **tiny())
+    with pytest.raises(ValueError, match="MultiInputActorCriticPolicy cannot be written as ONNX"):
+        export_onnx(model, tmp_path / "policy.onnx")
 
 
 class Wide(toy.PointEnv):

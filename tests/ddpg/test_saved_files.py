@@ -12,8 +12,9 @@ import torch as th
 from numbered import learner, numbered
 from small_buffers import make_env
 from small_models import make_model
+from stable_baselines3 import DDPG
 from stable_baselines3.common.buffers import DictReplayBuffer
-from toy import HORIZON
+from toy import HORIZON, PointEnv
 from tree import ROOT, run
 
 from sb3_follow_object.ddpg.actor_files import save_actor
@@ -77,6 +78,15 @@ def test_acts_the_same_in_another_process(
     case: tuple[str, str], actions: dict[tuple[str, str], list[np.ndarray]]
 ) -> None:
     np.testing.assert_array_equal(*actions[case])
+
+
+@pytest.mark.parametrize("what", ["model", "actor"])
+def test_what_is_no_actor_of_ours_is_not_saved_as_one(what: str, tmp_path: Path) -> None:
+    stock = DDPG("MultiInputPolicy", PointEnv(), buffer_size=100)
+    given: Any = stock.actor if what == "actor" else make_model()
+    with pytest.raises(ValueError, match="save_actor takes the actor of a HerPolicy"):
+        save_actor(tmp_path / "policy.safetensors", given, "Point-v0")
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_policy_is_loaded_whole(tmp_path: Path) -> None:

@@ -58,6 +58,21 @@ def test_copies_want_a_predictor_and_a_curriculum(
         ImaginedGoalVecEnv(DummyVecEnv([toy.PointEnv]), predictor, curriculum)
 
 
+@pytest.mark.parametrize("name", ["predictor", "curriculum"])
+def test_what_all_copies_share_is_not_set_in_copies(name: str) -> None:
+    env = imagining(toy.curriculum())
+    with pytest.raises(ValueError, match=f"{name} is shared by all copies"):
+        env.set_attr(name, env.get_attr(name)[0])
+
+
+def test_single_environments_and_no_predictor_are_refused() -> None:
+    single: Any = toy.PointEnv()
+    with pytest.raises(ValueError, match="ImaginedGoalVecEnv takes a VecEnv, not PointEnv"):
+        ImaginedGoalVecEnv(single, toy.StraightPredictor(), toy.curriculum())
+    with pytest.raises(ValueError, match="predictor must be a GoalPredictor, the folder of one"):
+        ImaginedGoalWrapper(single, None)  # type: ignore[arg-type]
+
+
 def test_original_goals_come_from_the_environment() -> None:
     finished = episodes(imagining(toy.curriculum()), 50)
     bare = DummyVecEnv([toy.PointEnv] * N)

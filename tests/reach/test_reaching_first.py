@@ -145,6 +145,18 @@ def test_share_of_the_episodes_begins_with_reaching_and_all_are_counted(face: st
     assert np.sum(again) == 0
 
 
+def test_episodes_that_an_outer_wrapper_ends_are_counted() -> None:
+    inner = ReachFirstWrapper(gym.make(TASK), **QUIET)
+    inner.set_reach(StraightActor(), 1.0)
+    env = gym.wrappers.TimeLimit(inner, HORIZON - 5)
+    for seed in range(4):
+        env.reset(seed=seed)
+        for _ in range(HORIZON - 5):
+            env.step(np.zeros(4, np.float32))
+    env.reset()
+    assert inner.take_counts().sum() == 4
+
+
 @pytest.mark.parametrize("face", FACES)
 def test_learner_that_comes_there_by_itself_is_counted(face: str) -> None:
     env = FACES[face](share=0.0)
