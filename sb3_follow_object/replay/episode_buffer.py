@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from ..imagination.goal_env import LAST
 from ..settings.sizes import check_buffer
 from .episode_table import EpisodeTable
 from .record_buffer import Gathered, RecordReplayBuffer
-from .steps import fitted, lost_steps, told
+from .steps import counted_steps, fitted, lost_steps, steps_in_reset, told
 
 GRAVITY = 9.81  # m/s^2
 _EPISODES = 1000  # whose goals say where goals lie
@@ -36,6 +38,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
     contexts = np.zeros((0, 0, 0), dtype=np.float32)
     _far: np.ndarray
     _amiss = np.zeros(0, dtype=bool)
+    _in_reset: Mapping[int, int] = MappingProxyType({})  # steps by environment, once it was asked
     rng: np.random.Generator
     table: EpisodeTable
     n_added: int
@@ -59,7 +62,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         What an info says was executed is stored in place of the action. A step that does not begin
         where the last one ended begins another episode: the environment was reset meanwhile. An
         episode is dropped, so that it is never sampled, whose info says "diverged" at its end, or
-        whose steps were not all stored (`lost_steps`).
+        whose steps were not all stored (`lost_steps`); what a wrapper does in `reset` is no step.
 
         Raises:
             ValueError: an array has another shape than the environments', or holds NaN or infinity,
@@ -166,13 +169,26 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         """End the episodes that the step ended; drop those that are not to be sampled."""
         for env_idx in done.nonzero()[0]:
             n_steps = (self.pos - self._current_ep_start[env_idx]) % self.buffer_size
-            if "diverged" in infos[env_idx] or lost_steps(infos[env_idx], n_steps):
+            lost = self._has_lost_steps(int(env_idx), infos[env_idx], int(n_steps))
+            if "diverged" in infos[env_idx] or lost:
                 self._current_ep_start[env_idx] = self.pos
             else:
                 self._compute_episode_length(int(env_idx))
         if self.full:  # one that is as long as the buffer would overwrite itself
             for env_idx in ((self._current_ep_start == self.pos) & ~done).nonzero()[0]:
                 self._compute_episode_length(int(env_idx))
+
+    def _has_lost_steps(self, env_idx: int, info: Mapping[str, Any], n_stored: int) -> bool:
+        """Whether an episode that ends had other steps than its `reset` took and were stored."""
+        counted = counted_steps(info)
+        before = self._in_reset.get(env_idx, 0)
+        if counted is None or (counted == n_stored and not before):
+            return False
+        # The environment stands where the next episode begins. Most take no steps in `reset`, so
+        # that one is asked after its first surprise, which is judged by the next episode's.
+        after = steps_in_reset(self.env, env_idx)
+        self._in_reset = {**self._in_reset, env_idx: after}
+        return lost_steps(counted - (before or after), n_stored)
 
     def end_episodes(self, env_indices: np.ndarray | None = None) -> None:
         """End running episodes where they stand, as a time limit would: they are sampled then.
@@ -190,6 +206,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         super().reset()
         self.table = EpisodeTable()
         self.n_added = 0
+        self._in_reset = {}
 
     def _forget_episode(self, row: int) -> None:
         """Make an episode that is about to be overwritten invisible to sampling."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, unwrap_vec_wrapper
 
 
 def check_copies(n_envs: int, n_copies: int) -> None:
@@ -76,13 +77,39 @@ def same_bytes(a: np.ndarray, b: np.ndarray) -> bool:
     return a.dtype == b.dtype and a.tobytes() == b.tobytes()
 
 
-def lost_steps(info: Mapping[str, Any], n_stored: int) -> bool:
-    """Whether SB3's Monitor counted other steps in an episode that ends than were stored.
+def counted_steps(info: Mapping[str, Any]) -> int | None:
+    """Steps that SB3's Monitor counted in an episode that ends; None without one."""
+    return (info.get("episode") or {}).get("l")
+
+
+def lost_steps(n_taken: int, n_stored: int) -> bool:
+    """Whether other steps were taken in an episode than were stored.
 
     An algorithm of SB3 whose `learn` is stopped in the middle of a step does not store it, and goes
     on from the observation before it where `reset_num_timesteps` is False: what it stores next
     never happened. A count of half as many again or more is that of a wrapper which repeats
     actions or ends episodes in parts.
     """
-    n_steps = (info.get("episode") or {}).get("l")
-    return n_steps is not None and n_steps != n_stored and n_steps < 1.5 * n_stored
+    return n_taken != n_stored and n_taken < 1.5 * n_stored
+
+
+def steps_in_reset(env: VecEnv | None, env_idx: int) -> int:
+    """Steps that a Monitor has counted in an episode which stands at its first observation.
+
+    They are those that a wrapper outside of it takes in `reset`, to let things settle; 0 where
+    no monitor tells.
+    """
+    if env is None:
+        return 0
+    monitor = unwrap_vec_wrapper(env, VecMonitor)
+    if monitor is not None:
+        return int(monitor.episode_lengths[env_idx])
+    # SB3's Monitor lists an episode's rewards, Gymnasium's RecordEpisodeStatistics counts its steps.
+    for name, kind in (("rewards", list), ("episode_lengths", int)):
+        try:
+            (count,) = env.get_attr(name, indices=[env_idx])
+        except (AttributeError, OSError, EOFError):  # not there, or closed
+            continue
+        if isinstance(count, kind):
+            return len(count) if isinstance(count, list) else count
+    return 0
