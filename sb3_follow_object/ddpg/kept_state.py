@@ -14,6 +14,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from ..common.copies import WholeCopies
 from ..common.torch_helpers import load_optimizer
 from ..replay.device_replay import DeviceReplay
+from ..replay.her_replay_buffer import FollowObjectReplayBuffer
 from .auxiliary import AuxiliaryCritic
 from .input_moments import InputMoments
 from .policies import HerPolicy
@@ -35,6 +36,21 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
 
     def _buffer_was_replaced(self, buffer: ReplayBuffer) -> None:
         self.moments.buffer_was_loaded(buffer)
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed as SB3 does, and begin the generators anew that a new algorithm would have.
+
+        A replay buffer with a seed of its own goes on with its generator.
+        """
+        super().set_random_seed(seed)
+        if seed is None or not hasattr(self, "policy"):  # `_setup_model` seeds before it makes them
+            return
+        own_seed = self.replay_buffer_kwargs.get("seed") is not None
+        if isinstance(self.replay_buffer, FollowObjectReplayBuffer) and not own_seed:
+            self.replay_buffer.rng = np.random.default_rng(np.random.randint(2**31))
+        self.rng = np.random.default_rng(np.random.randint(2**31))
+        if self._device_replay is not None:
+            self._device_replay.generator.manual_seed(np.random.randint(2**31))
 
     def __getstate__(self) -> dict[str, Any]:
         state = vars(self).copy()

@@ -104,7 +104,7 @@ def steps_in_reset(env: VecEnv | None, env_idx: int) -> int:
     monitor = unwrap_vec_wrapper(env, VecMonitor)
     if monitor is not None:
         return int(monitor.episode_lengths[env_idx])
-    # SB3's Monitor lists an episode's rewards, Gymnasium's RecordEpisodeStatistics counts its steps.
+    # SB3's Monitor lists an episode's rewards, Gymnasium's RecordEpisodeStatistics counts steps.
     for name, kind in (("rewards", list), ("episode_lengths", int)):
         try:
             (count,) = env.get_attr(name, indices=[env_idx])
