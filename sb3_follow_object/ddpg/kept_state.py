@@ -54,6 +54,7 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
 
     def __getstate__(self) -> dict[str, Any]:
         state = vars(self).copy()
+        state.pop("_stood", None)  # known by identity
         if "_logger" in state:  # its files and terminal are the original's
             state |= {"_logger": Logger(None, []), "_custom_logger": False}
         return state
@@ -138,6 +139,7 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
             if saved.shape == generator.get_state().shape:  # not of another kind of device
                 generator.set_state(saved)
         self._last_obs = state["last_obs"]
+        self._stood = None  # the environment is brought there by others
         self._last_episode_starts = np.ones(self.n_envs, dtype=bool)
         for name in self._COUNTERS:
             setattr(self, name, state["counters"][name])

@@ -25,6 +25,8 @@ class WholeEpisodesDDPG(DDPG):
 
     _step_is_open = False  # whether an action was chosen whose outcome has not been stored
     _known_buffer: ReplayBuffer | None = None  # that was looked at last
+    # The observation after the last step that was stored, and what a VecEnv replaces in `reset`.
+    _stood: tuple[Any, Any] | None = None
 
     def _setup_model(self) -> None:
         with usual_defaults():
@@ -49,6 +51,7 @@ class WholeEpisodesDDPG(DDPG):
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
             self.replay_buffer.check_env(env)
         super().set_env(env, force_reset)
+        self._stood = None
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         self._follow()
@@ -106,8 +109,8 @@ class WholeEpisodesDDPG(DDPG):
         if self.env is None:
             raise ValueError("the model was loaded without an environment: call set_env(env) first")
         self._follow()
-        if self._step_is_open:
-            self._last_obs = None  # the environment is a step further: SB3 resets it then
+        if self._step_is_open or self._was_reset():
+            self._last_obs = None  # the environment is elsewhere: SB3 resets it then
             self._step_is_open = False
         if reset_num_timesteps or self._last_obs is None:
             end_running_episodes(self.replay_buffer)
@@ -116,6 +119,17 @@ class WholeEpisodesDDPG(DDPG):
     def _store_transition(self, *args: Any, **kwargs: Any) -> None:
         super()._store_transition(*args, **kwargs)
         self._step_is_open = False
+        self._stood = (self._last_obs, self._options_of_env())
+
+    def _options_of_env(self) -> Any:
+        """Options for the next reset: SB3's environments make others in each, and in no step."""
+        return None if self.env is None else getattr(self.env.unwrapped, "_options", None)
+
+    def _was_reset(self) -> bool:
+        """Whether the environment was reset since the last step without a word to the algorithm."""
+        if self._stood is None or self._last_obs is not self._stood[0]:
+            return False
+        return self._options_of_env() is not self._stood[1]
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         # A rollout's end and tests may lie beyond the last step; schedules end at 0.
@@ -124,7 +138,7 @@ class WholeEpisodesDDPG(DDPG):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_known_buffer"]
+        return [*super()._excluded_save_params(), "_known_buffer", "_stood"]
 
 
 _NO_REPLAY: Any = np.empty(0)
