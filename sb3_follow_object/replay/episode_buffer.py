@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
 from ..envs.goal_envs import episode_steps
 from ..envs.goal_space import GoalSpace, goal_space
@@ -38,6 +39,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
     contexts = np.zeros((0, 0, 0), dtype=np.float32)
     _far: np.ndarray
     _amiss = np.zeros(0, dtype=bool)
+    _warned_of_clipping = False
     _in_reset: Mapping[int, int] = MappingProxyType({})  # steps by environment, once it was asked
     rng: np.random.Generator
     table: EpisodeTable
@@ -123,10 +125,12 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
     def _with_last_observations(
         self, next_obs: dict[str, np.ndarray], done: np.ndarray, infos: list[dict[str, Any]]
     ) -> dict[str, np.ndarray]:
-        """Return next observations in which nothing is clipped.
+        """Return next observations in which nothing is clipped that this package's wrappers tell.
 
         VecNormalize keeps raw observations, but of an episode's last one only what it has scaled
         and clipped, and SB3 cannot undo the clipping: a first lift would be a lift of millimetres.
+        The wrappers of imagined goals and of reaching tell it as it was (`LAST`), where no wrapper
+        outside of them ends the episode. Elsewhere it stays clipped, with a warning, once.
         """
         ended = np.flatnonzero(done)
         normalizer = unwrap_vec_normalize(self.env) if ended.size and self.env else None
@@ -136,6 +140,8 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         for env_idx in ended:
             last = infos[env_idx].get(LAST)
             seen = infos[env_idx].get("terminal_observation")
+            if last is None:
+                self._warn_if_clipped(normalizer, seen)
             if last is None or seen is None:
                 continue
             scaled = normalizer.normalize_obs(last)
@@ -144,6 +150,23 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
                 for key, value in last.items():
                     next_obs[key][env_idx] = value
         return next_obs
+
+    def _warn_if_clipped(self, normalizer: VecNormalize, seen: Any) -> None:
+        """Warn, once, where VecNormalize has clipped an episode's last observation."""
+        if self._warned_of_clipping or not normalizer.norm_obs or not isinstance(seen, dict):
+            return
+        limit = np.float32(normalizer.clip_obs)
+        for key in normalizer.norm_obs_keys or ():
+            if key in seen and (np.abs(seen[key]) >= limit).any():
+                self._warned_of_clipping = True
+                warnings.warn(
+                    f"VecNormalize has clipped {key!r} of an episode's last observation at "
+                    f"clip_obs {limit:g}, and so it is stored: nothing told it as it was. Put the "
+                    "environment into ImaginedGoalWrapper or ReachFirstWrapper with its time limit "
+                    "inside, or raise clip_obs",
+                    stacklevel=4,
+                )
+                return
 
     def _executed(self, chosen: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """Return what was executed in place of the actions chosen, both scaled (n_envs, d)."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeLimit
 from imagined import imagining
 from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
@@ -49,11 +51,18 @@ FACES: dict[str, Callable[[], VecEnv]] = {
 }
 
 
-@pytest.mark.parametrize("face", FACES)
-def test_an_episodes_last_observation_is_not_clipped(face: str) -> None:
+def limited() -> VecEnv:
+    def make() -> Any:
+        inner = ImaginedGoalWrapper(Leaping(), StraightPredictor(), curriculum())
+        return TimeLimit(inner, HORIZON - 1)
+
+    return DummyVecEnv([make] * 2)
+
+
+def learn(env: VecEnv, clip_obs: float = 5.0) -> Any:
     model = DDPG(
         "MultiInputPolicy",
-        VecNormalize(FACES[face](), norm_reward=False, clip_obs=5.0),
+        VecNormalize(env, norm_reward=False, clip_obs=clip_obs),
         replay_buffer_class=FollowObjectReplayBuffer,
         learning_starts=10**9,
         train_freq=HORIZON,
@@ -62,12 +71,34 @@ def test_an_episodes_last_observation_is_not_clipped(face: str) -> None:
         seed=0,
     )
     model.learn(10 * HORIZON)
-    buffer: Any = model.replay_buffer
+    return model.replay_buffer
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_an_episodes_last_observation_is_not_clipped(face: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        buffer = learn(FACES[face]())
     first, last = (slice(at, buffer.pos, HORIZON) for at in (0, HORIZON - 1))
     for key in ("observation", "achieved_goal"):
         leaps = buffer.next_observations[key][last] - buffer.observations[key][first]
         np.testing.assert_allclose(leaps[..., 2], 2.0, atol=1e-6)
     assert buffer.goals_are_shared, "goals are the same before and after a step"
+
+
+@pytest.mark.parametrize("make", [lambda: DummyVecEnv([Leaping] * 2), limited])
+def test_where_nothing_tells_it_a_warning_says_once_that_it_is_clipped(make: Any) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        learn(make(), clip_obs=0.5)
+    (sentence,) = [str(each.message) for each in caught if "clip_obs" in str(each.message)]
+    assert "last observation at clip_obs 0.5" in sentence
+
+
+def test_what_is_not_clipped_there_needs_no_warning() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        learn(DummyVecEnv([Leaping] * 2), clip_obs=1000.0)
 
 
 def test_what_another_wrapper_has_changed_is_not_taken_back() -> None:
