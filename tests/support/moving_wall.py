@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 
 WALL = "MovingWall-v0"
-FIXED = '<geom name="wall" type="box" pos="0.4 0 0.03" size="0.08 0.01 0.03" rgba=".4 .6 .9 1"/>'
+FIXED = '<geom name="wall" type="box" pos="0.4 0 0.03" size="0.05 0.01 0.03" rgba=".4 .6 .9 1"/>'
 MOVED = (
     '<body name="wall" pos="0.4 0 0.03">'
-    '<geom type="box" size="0.08 0.01 0.03" rgba=".4 .6 .9 1"/></body>'
+    '<geom type="box" size="0.05 0.01 0.03" rgba=".4 .6 .9 1"/></body>'
     '<body name="paint" pos="0 0 0"><geom type="box" size=".01 .01 .01" contype="0" '
     'conaffinity="0"/></body>'
     '<body name="target" mocap="true"><geom type="sphere" size=".01" pos="0 0 -0.2"/></body>'
