@@ -22,7 +22,7 @@ from stable_baselines3.common.type_aliases import (
 
 from ..common.numbers import checked_whole
 from ..common.torch_helpers import matmul_at, threads_at, usual_defaults
-from ..replay.device_replay import DeviceReplay, device_replay_of
+from ..replay.device_replay import DeviceReplay, device_replay_of, samples_otherwise
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
 from ..settings.learning import AlgorithmSettings
 from .auxiliary import Transitions, make_auxiliary, resolve_auxiliary
@@ -229,7 +229,7 @@ class HerDDPG(KeptDDPG):
                 "DDPG and TD3"
             )
         self.policy.averages = True
-        without_steps = self.replay_buffer is not None and _samples_otherwise(self.replay_buffer)
+        without_steps = self.replay_buffer is not None and samples_otherwise(self.replay_buffer)
         if self.hindsight_bound and without_steps:
             raise ValueError(
                 "hindsight_bound needs a FollowObjectReplayBuffer, whose sample_with_steps knows "
@@ -409,7 +409,7 @@ class HerDDPG(KeptDDPG):
         """Draw n transitions for so many batches, and (n, 1) steps until each goal was reached."""
         buffer = self.replay_buffer
         assert buffer is not None
-        if isinstance(buffer, FollowObjectReplayBuffer) and not _samples_otherwise(buffer):
+        if isinstance(buffer, FollowObjectReplayBuffer) and not samples_otherwise(buffer):
             if self._device_replay is not None:
                 return self._device_replay.sample_with_steps(n)
             return buffer.sample_with_steps(n, n_batches=n_batches)
@@ -423,8 +423,3 @@ class HerDDPG(KeptDDPG):
             live += self.auxiliary_critic.q_networks.parameters()
             target += self.auxiliary_critic.target_networks.parameters()
         return live, target
-
-
-def _samples_otherwise(buffer: ReplayBuffer) -> bool:
-    """Whether a buffer's batches come from a `sample` that knows nothing of steps to goals."""
-    return not isinstance(buffer, FollowObjectReplayBuffer) or buffer.samples_otherwise()

@@ -211,7 +211,6 @@ class HerPolicy(WholeModule, TD3Policy):
     @th.no_grad()
     def update_average(self, decay: float) -> None:
         """Move the averaged actor towards the actor, keeping the share `decay` in [0, 1] of it."""
-        self.averages = True
         average: list[th.Tensor] = [*self.actor_average.parameters()]
         live: list[th.Tensor] = [*self.actor.parameters()]
         if decay == 0.0:  # exactly, to the last bit

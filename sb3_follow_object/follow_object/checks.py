@@ -26,7 +26,7 @@ from ..object_stage.sldr import task_of_package
 from ..reach.approach import BEHIND, check_reachable, reach_first_settings
 from ..settings.fields import checked, settings_of
 from ..settings.learning import PredictorSettings
-from ..settings.run_config import check_plain
+from ..settings.run_config import RunConfig, check_plain
 from ..settings.sizes import check_stages
 from ..settings.stages import ReachFirstSettings, ReachTeachingSettings, StageSettings
 
@@ -152,3 +152,16 @@ def _check_algorithm(env: VecEnv, horizon: int, arguments: dict[str, Any]) -> No
     except Exception as error:  # SB3 and torch raise anything; so do others' environments
         reason = str(error) or type(error).__name__
         raise ValueError(f"the algorithm cannot be built: {reason}") from error
+
+
+def check_places(arguments: Mapping[str, Any], overrides: Mapping[str, Any]) -> None:
+    """Raise a ValueError for what `from_preset` takes elsewhere or not at all.
+
+    Args:
+        arguments: those of the class.
+        overrides: settings by their dotted names.
+    """
+    for name in settings_of(StageSettings).keys() & arguments.keys():
+        raise ValueError(f"{name} is a setting: give overrides={{{name!r}: ...}}")
+    for name in settings_of(RunConfig).keys() & overrides.keys():
+        raise ValueError(f"{name} is of a run folder, which train() makes; learn() takes env steps")

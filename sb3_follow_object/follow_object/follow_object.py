@@ -28,11 +28,11 @@ from ..object_stage.networks import FILE as OBJECT_FILE
 from ..object_stage.networks import ObjectNetworks
 from ..object_stage.sldr import reads_object_networks
 from ..object_stage.stage import ObjectStage
-from ..settings.fields import check_names, settings_of
+from ..settings.fields import check_names
 from ..settings.presets import run_config
-from ..settings.run_config import RunConfig, check_plain
+from ..settings.run_config import check_plain
 from ..settings.stages import StageSettings
-from .checks import check_algorithms, checked_settings, on_table_for, reach_in
+from .checks import check_algorithms, check_places, checked_settings, on_table_for, reach_in
 from .robot_stage import RobotStage
 from .saved_folder import Saved, read, saved_id, write
 
@@ -219,7 +219,7 @@ class FollowObject:
             ValueError: an invalid id, key or value, with the nearest valid one; or
                 a setting among the arguments, or one of a run folder, such as n_timesteps.
         """
-        _check_places(arguments, overrides or {})
+        check_places(arguments, overrides or {})
         own = [name for name in _OF_AN_ENVIRONMENT if name in arguments]
         given = {name: arguments.pop(name) for name in own}
         env_id = registered(env_id, **given)
@@ -435,19 +435,6 @@ class FollowObject:
     def close(self) -> None:
         """Close all environments."""
         self.robot_stage.close()
-
-
-def _check_places(arguments: Mapping[str, Any], overrides: Mapping[str, Any]) -> None:
-    """Raise a ValueError for what `from_preset` takes elsewhere or not at all.
-
-    Args:
-        arguments: those of the class.
-        overrides: settings by their dotted names.
-    """
-    for name in settings_of(StageSettings).keys() & arguments.keys():
-        raise ValueError(f"{name} is a setting: give overrides={{{name!r}: ...}}")
-    for name in settings_of(RunConfig).keys() & overrides.keys():
-        raise ValueError(f"{name} is of a run folder, which train() makes; learn() takes env steps")
 
 
 def _say_nothing(sentence: str) -> None:

@@ -151,7 +151,7 @@ class DeviceReplay(WholeCopies):
             "cher": buffer.selection is not None,
             "reward_function": buffer.reward_function is not None,
             "copy_info_dict": buffer.copy_info_dict,
-            "sample of a subclass": buffer.samples_otherwise(),
+            "sample of a subclass": samples_otherwise(buffer),
             "observations that are not vectors of floats": buffer.achieved is None
             or not keys <= stored,
             "actions that are not floats": "actions" not in stored,
@@ -291,3 +291,11 @@ class DeviceReplay(WholeCopies):
     def _achieved_goals(self, flat: th.Tensor) -> th.Tensor:
         assert self._buffer.achieved is not None
         return self._buffer.achieved.fields(self._achieved.index_select(0, flat))[ACHIEVED]
+
+
+def samples_otherwise(buffer: Any) -> bool:
+    """Whether a buffer's batches come from a `sample` that knows nothing of steps to goals."""
+    ours, kind = FollowObjectReplayBuffer, type(buffer)
+    if not issubclass(kind, ours):
+        return True
+    return kind.sample is not ours.sample and kind.sample_with_steps is ours.sample_with_steps

@@ -282,12 +282,6 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             return {}
         return {"cher/proximity_weight": float(self.selection.proximity_weights(1)[0])}
 
-    @classmethod
-    def samples_otherwise(cls) -> bool:
-        """Whether a subclass has a `sample` of its own, which `sample_with_steps` does not ask."""
-        ours = FollowObjectReplayBuffer
-        return cls.sample is not ours.sample and cls.sample_with_steps is ours.sample_with_steps
-
     def sample(  # type: ignore[override]
         self, batch_size: int, env: VecNormalize | None = None
     ) -> DictReplayBufferSamples:

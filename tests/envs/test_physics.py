@@ -5,6 +5,7 @@ from pathlib import Path
 from types import ModuleType
 
 import gymnasium as gym
+import gymnasium_robotics
 import mujoco
 import numpy as np
 import pytest
@@ -17,8 +18,7 @@ BLOCKED = Task("Blocked", AROUND_GRIPPER, AROUND_GRIPPER, blocked_gripper=True)
 
 
 def original(env_id: str) -> gym.Env:
-    robotics = pytest.importorskip("gymnasium_robotics")
-    gym.register_envs(robotics)
+    gym.register_envs(gymnasium_robotics)
     try:
         env = gym.make(env_id).unwrapped
         env.reset(seed=0)

@@ -124,7 +124,6 @@ def test_run_folder_stopped_in_the_robots_stage_resumes_exactly(tmp_path: Path) 
 def test_environments_that_cannot_tell_their_state_resume_exactly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("gymnasium_robotics")
     monkeypatch.setattr(evaluation, "_COPIES", 1)  # each takes as long as two rollouts to make
     tiny = {**runs.TINY, "imagine": False, "reach": REACH}
     short = {"total_timesteps": 400, "eval_every": 10**6, "n_final_episodes": 1}

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
+import gymnasium_robotics
 import numpy as np
 import pytest
 import toy
@@ -244,7 +245,6 @@ def test_the_gymnasium_wrapper_follows_its_seed() -> None:
 
 
 def test_a_fetch_task_of_gymnasium_robotics() -> None:
-    gymnasium_robotics = pytest.importorskip("gymnasium_robotics")
     gym.register_envs(gymnasium_robotics)
     curriculum = toy.curriculum(p=0.0, k_max=3)
 
@@ -263,7 +263,6 @@ def test_a_fetch_task_of_gymnasium_robotics() -> None:
 
 
 def test_a_folder_of_a_task_that_was_learned_with_a_module_before_its_id(tmp_path: Path) -> None:
-    pytest.importorskip("gymnasium_robotics")
     env_id = "gymnasium_robotics:FetchPush-v4"
     line = np.tile(np.linspace([1.3, 0.7, 0.42], [1.4, 0.8, 0.42], 51), (8, 1, 1))
     fit: dict[str, Any] = {"physics": "a line", "hidden": (4,), "epochs": 1}
