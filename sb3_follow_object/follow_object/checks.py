@@ -3,50 +3,22 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..any_task.tasks import (
-    effector_of,
-    effector_seen_in,
-    object_vec_env,
-    steps_of_object,
-    steps_to_reach,
-)
-from ..common.numbers import checked_whole
+from ..any_task.tasks import object_vec_env, steps_of_object
 from ..common.torch_helpers import usable_device
 from ..ddpg.folding import AUTO
 from ..ddpg.her_ddpg import HerDDPG
-from ..envs import IDS
 from ..object_stage.networks import SAY_NO_MIRRORS
 from ..object_stage.sldr import task_of_package
 from ..reach.approach import BEHIND, check_reachable, reach_first_settings
-from ..settings.fields import checked, settings_of
+from ..settings.fields import settings_of
 from ..settings.learning import PredictorSettings
-from ..settings.run_config import RunConfig, check_plain
 from ..settings.sizes import check_stages
-from ..settings.stages import ReachFirstSettings, ReachTeachingSettings, StageSettings
-
-
-def checked_settings(env_id: str, given: Mapping[str, Any], seed: int) -> dict[str, Any]:
-    """Return the settings of a `FollowObject`; warn of one that a save could not hold.
-
-    Raises:
-        ValueError: one is unknown or out of range.
-    """
-    settings = {
-        "env_id": env_id,
-        **checked(StageSettings, given, "FollowObject"),
-        "seed": checked_whole("seed", seed, 0),
-    }
-    try:
-        check_plain(settings, "save()")
-    except ValueError as error:
-        warnings.warn(f"{error}; all else can be done", stacklevel=3)  # of who makes one
-    return settings
+from ..settings.stages import ReachFirstSettings, ReachTeachingSettings
 
 
 def check_algorithms(
@@ -107,40 +79,6 @@ def reach_parts(
     return first, teaching
 
 
-def reach_in(reach: Any, env_id: str, imagine: bool) -> Any:
-    """Return the setting `reach` with what a task of others says of it: effector and steps.
-
-    Args:
-        reach: as given.
-        env_id: a task; the physics of one of others says where the observation tells the effector.
-        imagine: whether goals are imagined.
-
-    Raises:
-        ValueError: no part of the robot is told in the observation.
-    """
-    if not isinstance(reach, Mapping) or env_id in IDS:
-        return reach
-    found: dict[str, Any] = {"max_steps": steps_to_reach(env_id)}
-    if "effector" not in reach:
-        effector = effector_of(env_id) if imagine else effector_seen_in(env_id)
-        if effector is not None:
-            found["effector"] = effector
-    return {**found, **reach}
-
-
-def on_table_for(lift: object, on_table: bool | None) -> bool:
-    """Return the setting object_on_table that a setting `lift` other than "auto" means.
-
-    Raises:
-        ValueError: it is neither True nor False, or both are given.
-    """
-    if not isinstance(lift, bool):
-        raise ValueError(f'lift must be True, False or "auto", not {lift!r}')
-    if on_table is not None:
-        raise ValueError("lift and object_on_table say the same; give one of them")
-    return not lift
-
-
 def _check_algorithm(env: VecEnv, horizon: int, arguments: dict[str, Any]) -> None:
     if (arguments.get("replay_buffer_kwargs") or {}).get("copy_info_dict"):
         raise ValueError("copy_info_dict cannot be set: checkpoints do not hold infos")
@@ -152,16 +90,3 @@ def _check_algorithm(env: VecEnv, horizon: int, arguments: dict[str, Any]) -> No
     except Exception as error:  # SB3 and torch raise anything; so do others' environments
         reason = str(error) or type(error).__name__
         raise ValueError(f"the algorithm cannot be built: {reason}") from error
-
-
-def check_places(arguments: Mapping[str, Any], overrides: Mapping[str, Any]) -> None:
-    """Raise a ValueError for what `from_preset` takes elsewhere or not at all.
-
-    Args:
-        arguments: those of the class.
-        overrides: settings by their dotted names.
-    """
-    for name in settings_of(StageSettings).keys() & arguments.keys():
-        raise ValueError(f"{name} is a setting: give overrides={{{name!r}: ...}}")
-    for name in settings_of(RunConfig).keys() & overrides.keys():
-        raise ValueError(f"{name} is of a run folder, which train() makes; learn() takes env steps")

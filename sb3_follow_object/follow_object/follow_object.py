@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,10 +28,9 @@ from ..object_stage.networks import ObjectNetworks
 from ..object_stage.sldr import reads_object_networks
 from ..object_stage.stage import ObjectStage
 from ..settings.fields import check_names
-from ..settings.presets import run_config
 from ..settings.run_config import check_plain
-from ..settings.stages import StageSettings
-from .checks import check_algorithms, check_places, checked_settings, on_table_for, reach_in
+from .checks import check_algorithms
+from .given_settings import run_settings
 from .robot_stage import RobotStage
 from .saved_folder import Saved, read, saved_id, write
 
@@ -44,12 +42,15 @@ class FollowObject:
 
     `learn()` runs the three stages of the paper (section 4): the object alone learns to reach the
     goal; its paths train F_phi; the robot trains on original goals and on the goals that F_phi
-    imagines at growing distance. Its defaults are the plain method's; `from_preset` takes what was
-    measured to be best, reaching first among it, and is what to begin with.
+    imagines at growing distance. It has the settings that `sb3-follow-object train` takes for the
+    task, unless they are given otherwise.
 
     Args:
         env_id: a task of this package, e.g. "FollowObject/PnPShelf-v0", or any goal environment on
             MuJoCo that gymnasium knows, e.g. "FetchPickAndPlace-v4".
+        method: one of `METHODS`; None, "fo".
+        preset: "default", what was measured to be best, or "paper", the authors' settings; None,
+            each setting's own default, which are the plain method's.
         make_env: in place of an id, a function that makes such an environment.
         object: name of the body that the goals are about; by default it is found.
         goal: for environments without goals, a function of (env, observation) that returns the
@@ -61,80 +62,41 @@ class FollowObject:
         lift: whether the object may leave its surface in the first stage; "auto" decides by the
             heights of the goals, and by whether the object learns. The opposite of
             `object_on_table`.
-        imagine: False trains the robot on original goals only, i.e. DDPG + HER: no object stage.
         predictor: an F_phi made before for this task; skips the first two stages.
         object_networks: of an object stage made before for this task; needed beside `predictor`
             where `algorithm` has the auxiliary reward "sldr", which reads them.
-        n_envs: parallel copies of the robot's environment, >= 1.
-        n_threads: of the simulation; by default as many as there are cores.
-        reward_type: "sparse" (paper) or "dense".
-        algorithm: keyword arguments of the robot's `HerDDPG`.
-        reach: of `ReachSettings`: a learned policy takes the effector to the object at the
-            beginning of a share of the training episodes. {} takes the defaults; None, none does.
-        curriculum: keyword arguments of `Curriculum` besides the horizon.
-        object_algorithm: keyword arguments of the object's `HerDDPG`.
-        object_on_table: whether the object may not leave the table in the first stage; by default
-            where the gripper is blocked (Push tasks), so that the imagined goals can be reached by
-            pushing. The paper's object may always leave it.
-        object_n_envs: parallel copies of the object's environment, >= 1.
-        object_timesteps: env steps after which the object stage gives up.
-        object_test_every: rollouts of every copy between two tests of the object's policy.
-        object_test_episodes: episodes of such a test.
-        object_success: success rate of two such tests in a row that ends the object's stage.
-        object_error: mean error of F_phi, in metres, beyond which the object learns for as many
-            steps again, once; 0, never (paper).
-        n_paths: noise-free object paths that F_phi is fitted on.
-        predictor_fit: keyword arguments of `GoalPredictor.fit`.
-        inverse_fit: keyword arguments of `ObjectNetworks.learned`, about the inverse model.
-        test_every: rollouts of every copy between two tests at k_max.
-        n_test_episodes: episodes a test; by default `n_envs`.
-        store_tests: whether the episodes of the tests enter the replay buffer.
         seed: decides the whole run.
         report: called with a sentence as stages begin and end.
+        **settings: of the three stages, as `sb3-follow-object settings` lists them, e.g. n_envs=8,
+            reach=None, curriculum={"p": 0.5}, algorithm={"batch_size": 256}, which is the robot's
+            `HerDDPG`; what a mapping leaves out stays the preset's.
 
     Attributes:
         object_stage: the first two stages, what they learned and what they cost.
         robot_stage: the third.
 
     Raises:
-        ValueError: unknown task, a predictor made for another one, or an argument out of range.
+        ValueError: an unknown task, method, preset or setting, with the nearest known one; a
+            predictor made for another task, or a value out of range.
     """
 
     def __init__(
         self,
         env_id: str | None = None,
         *,
+        method: str | None = None,
+        preset: str | None = "default",
         make_env: MakeEnv | None = None,
         object: str | None = None,
         goal: GoalOf | None = None,
         is_success: Judge | None = None,
         effector: EffectorOf | None = None,
         lift: bool | Literal["auto"] = "auto",
-        imagine: bool = True,
         predictor: GoalPredictor | None = None,
         object_networks: ObjectNetworks | None = None,
-        n_envs: int = StageSettings.n_envs,
-        n_threads: int | None = StageSettings.n_threads,
-        reward_type: str = StageSettings.reward_type,
-        algorithm: dict[str, Any] | None = None,
-        reach: dict[str, Any] | None = None,
-        curriculum: dict[str, Any] | None = None,
-        object_algorithm: dict[str, Any] | None = None,
-        object_on_table: bool | None = StageSettings.object_on_table,
-        object_n_envs: int = StageSettings.object_n_envs,
-        object_timesteps: int = StageSettings.object_timesteps,
-        object_test_every: int = StageSettings.object_test_every,
-        object_test_episodes: int = StageSettings.object_test_episodes,
-        object_success: float = StageSettings.object_success,
-        object_error: float = StageSettings.object_error,
-        n_paths: int = StageSettings.n_paths,
-        predictor_fit: dict[str, Any] | None = None,
-        inverse_fit: dict[str, Any] | None = None,
-        test_every: int = StageSettings.test_every,
-        n_test_episodes: int | None = StageSettings.n_test_episodes,
-        store_tests: bool = StageSettings.store_tests,
         seed: int = 0,
         report: Report | None = None,
+        **settings: Any,
     ):
         full_id = registered(
             env_id,
@@ -144,34 +106,8 @@ class FollowObject:
             is_success=is_success,
             effector=effector,
         )
-        env_id = known_id(full_id)
-        if lift != "auto":
-            object_on_table = on_table_for(lift, object_on_table)
-        given = {
-            "imagine": imagine,
-            "n_envs": n_envs,
-            "n_threads": n_threads,
-            "reward_type": reward_type,
-            "algorithm": algorithm or {},
-            **({} if reach is None else {"reach": reach_in(reach, env_id, imagine)}),
-            "curriculum": curriculum or {},
-            "object_algorithm": object_algorithm or {},
-            "object_on_table": object_on_table,
-            "object_n_envs": object_n_envs,
-            "object_timesteps": object_timesteps,
-            "object_test_every": object_test_every,
-            "object_test_episodes": object_test_episodes,
-            "object_success": object_success,
-            "object_error": object_error,
-            "n_paths": n_paths,
-            "predictor_fit": predictor_fit or {},
-            "inverse_fit": inverse_fit or {},
-            "test_every": test_every,
-            "n_test_episodes": n_envs if n_test_episodes is None else n_test_episodes,
-            "store_tests": store_tests,
-        }
-        self.settings = checked_settings(env_id, given, seed)
-        self.env_id = env_id
+        self.settings = run_settings(full_id, method, preset, settings, lift, seed)
+        self.env_id: str = self.settings["env_id"]
         self.full_id = full_id  # with the module that registers it, as given
         self.imagine: bool = self.settings["imagine"]
         self.seed: int = self.settings["seed"]
@@ -192,39 +128,6 @@ class FollowObject:
                 "the auxiliary reward 'sldr' needs the object's networks beside the predictor; "
                 f"give those of the same object stage ({OBJECT_FILE}), or neither"
             )
-
-    @classmethod
-    def from_preset(
-        cls,
-        env_id: str | None = None,
-        *,
-        method: str = "fo",
-        preset: str = "default",
-        seed: int = 0,
-        overrides: Mapping[str, Any] | None = None,
-        **arguments: Any,
-    ) -> FollowObject:
-        """Return one with the settings that `sb3-follow-object train` takes for a task.
-
-        Args:
-            env_id: the task.
-            method: one of `METHODS`.
-            preset: "default", what was measured to be best, or "paper", the authors' settings.
-            seed: decides the whole run.
-            overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win.
-            **arguments: of the class, which are no settings: predictor, object_networks, report,
-                make_env, object, goal, is_success, effector, lift.
-
-        Raises:
-            ValueError: an invalid id, key or value, with the nearest valid one; or
-                a setting among the arguments, or one of a run folder, such as n_timesteps.
-        """
-        check_places(arguments, overrides or {})
-        own = [name for name in _OF_AN_ENVIRONMENT if name in arguments]
-        given = {name: arguments.pop(name) for name in own}
-        env_id = registered(env_id, **given)
-        config = run_config(env_id, method=method, preset=preset, seed=seed, overrides=overrides)
-        return cls(env_id, seed=seed, **config.settings, **arguments)
 
     @property
     def has_object_stage(self) -> bool:
@@ -416,6 +319,7 @@ class FollowObject:
         try:
             saved = read(folder)
             run = cls(
+                preset=None,
                 **saved.settings,
                 predictor=saved.predictor,
                 object_networks=saved.object_networks,

@@ -76,6 +76,7 @@ def train(
         stop = stack.enter_context(StopSignals())
         run = FollowObject(
             config.env_id,
+            preset=None,  # the settings are whole
             seed=config.seed,
             report=report,
             **copy.deepcopy(config.settings),  # SB3 writes into policy_kwargs

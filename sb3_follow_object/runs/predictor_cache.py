@@ -104,7 +104,11 @@ def learn_predictor(
 ) -> GoalPredictor:
     """Run stages one and two (paper, sections 4.1 and 4.2) and save what a folder lacks of both."""
     run = FollowObject(
-        config.env_id, seed=config.seed, report=report, **{**config.settings, "n_envs": 1}
+        config.env_id,
+        preset=None,
+        seed=config.seed,
+        report=report,
+        **{**config.settings, "n_envs": 1},
     )
     try:
         predictor = run.object_stage.learn_predictor(networks=True)

@@ -28,7 +28,7 @@ from ..zoo_configs import FOLDER
 from .fields import Group, Setting, check_names, settings_of
 from .learning import AlgorithmSettings, check_auxiliary
 from .methods import METHODS as METHODS
-from .methods import WITHOUT_PAPER
+from .methods import WITHOUT_PAPER, who_trains
 from .run_config import CONFIG, RunConfig
 from .sizes import check_sizes
 from .stages import ReachFirstSettings, ReachTeachingSettings, StageSettings, part_of_reach
@@ -66,7 +66,21 @@ _GROUPS: tuple[type[Group], ...] = (RunConfig, StageSettings, AlgorithmSettings)
 
 
 def preset_file(method: str, preset: str = "default") -> Path:
-    """Return the YAML file of a method that comes with the package."""
+    """Return the YAML file of a method that comes with the package.
+
+    Raises:
+        ValueError: there is no such method or preset, with the nearest that there is.
+    """
+    if method not in METHODS:
+        meant = f"; {who}" if (who := who_trains(str(method))) else did_you_mean(method, METHODS)
+        raise ValueError(f"there is no method {method!r}{meant}")
+    if preset not in PRESETS:
+        raise ValueError(f"there is no preset {preset!r}{did_you_mean(preset, PRESETS)}")
+    if method in WITHOUT_PAPER and preset == "paper":
+        raise ValueError(
+            f"{method!r} has no preset 'paper', for the paper has no such rival; leave the preset "
+            "out"
+        )
     name = method if preset == "default" else f"{method}-{preset}"
     return FOLDER / f"{name}.yml"
 
@@ -99,11 +113,6 @@ def run_config(
     env_id = name if name in IDS else env_id
     if file is None:
         method = method or "fo"
-        if method in WITHOUT_PAPER and preset == "paper":
-            raise ValueError(
-                f"{method!r} has no preset 'paper', for the paper has no such rival; leave the "
-                "preset out"
-            )
         path = preset_file(method, preset)
     else:
         path = Path(file)

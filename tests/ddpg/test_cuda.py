@@ -14,13 +14,13 @@ import pytest
 import torch as th
 from small_buffers import fill, make_buffer, make_env
 from small_models import assert_resumes_exactly, make_model, success_rate, weights
+from tiny_runs import bare_run
 from toy import paths
 
 from sb3_follow_object.ddpg.actor_files import load_actor, save_actor
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.ddpg.updates import Updates
 from sb3_follow_object.envs import physics_id
-from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.replay.device_replay import DeviceReplay
 
@@ -195,7 +195,7 @@ def test_a_run_imagines_where_it_learns() -> None:
     ways = np.random.default_rng(0).uniform(size=(8, 51, 3))
     facts = {"env_id": task, "physics": physics_id(task)}
     predictor = GoalPredictor.fit(ways, ways[:, -1], epochs=1, **facts)
-    run = FollowObject(task, n_envs=2, n_threads=1, predictor=predictor, algorithm={"device": CUDA})
+    run = bare_run(task, n_envs=2, n_threads=1, predictor=predictor, algorithm={"device": CUDA})
     model = run.prepare()
     assert predictor.device == model.device
     assert np.isfinite(run.env.reset()["desired_goal"]).all()  # type: ignore[call-overload]

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from cli_runs import TINY
 from gymnasium.utils.env_checker import check_env
+from tiny_runs import bare_run
 
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.comparison.cells import Settings
@@ -36,7 +37,6 @@ from sb3_follow_object.envs import (
 )
 from sb3_follow_object.envs.scene import fetch_scene
 from sb3_follow_object.envs.tasks import Landmarks
-from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.settings.presets import load_config, run_config
 
 MODULE = "own_tasks"
@@ -214,7 +214,7 @@ def test_a_module_before_the_id_does_not_change_the_kind() -> None:
 def test_a_save_is_loaded_where_its_module_was_not_imported(tmp_path: Path) -> None:
     small = {"policy_kwargs": {"net_arch": [8]}, "gradient_steps": 1, "batch_size": 8}
     small |= {"buffer_size": 100}
-    run = FollowObject(FULL, imagine=False, n_envs=1, n_threads=1, algorithm=small)
+    run = bare_run(FULL, imagine=False, n_envs=1, n_threads=1, algorithm=small)
     run.learn(run.horizon).save(tmp_path / "save")
     run.close()
     code = "from sb3_follow_object import FollowObject\n"

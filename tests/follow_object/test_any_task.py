@@ -14,7 +14,7 @@ import torch as th
 from gymnasium.wrappers import TimeLimit
 from kept_states import keeping
 from small_models import weights
-from tiny_runs import SMALL_NET, TINY, config, quiet
+from tiny_runs import SMALL_NET, TINY, bare_run, config, quiet
 
 from sb3_follow_object.any_task import derived as looking
 from sb3_follow_object.any_task.tasks import kept_as
@@ -42,8 +42,8 @@ def few_resets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_save_goes_on_as_the_whole_does(tmp_path: Path) -> None:
     settings = {**TINY, "reach": {"n_updates": 3, "batch_size": 16}}
-    whole = FollowObject(ARM, **settings).learn(3200)
-    part = FollowObject(ARM, **settings).learn(2800)
+    whole = bare_run(ARM, **settings).learn(3200)
+    part = bare_run(ARM, **settings).learn(2800)
     assert part.model is not None and part.settings["reach"]["effector"] == (0, 1, 2)
     assert part.predictor is not None and part.predictor.object_on_table
     part.save(tmp_path / "part")
@@ -59,7 +59,7 @@ def test_a_save_of_an_environment_that_a_function_made(
     def made() -> gym.Env:
         return TimeLimit(arm_and_wall.ArmAndWall(), 50)  # type: ignore[attr-defined]
 
-    run = FollowObject(make_env=made, imagine=False, **TINY).learn(400)
+    run = bare_run(make_env=made, imagine=False, **TINY).learn(400)
     run.save(tmp_path / "run")
     monkeypatch.delitem(gym.registry, run.env_id)  # as in another process
     with pytest.raises(ValueError, match="came with functions: give load\\(\\) make_env="):
@@ -79,7 +79,7 @@ def test_a_save_of_an_environment_that_a_function_made(
 )
 def test_what_is_missing_is_said_at_once(env_id: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        FollowObject(env_id, **TINY)
+        bare_run(env_id, **TINY)
 
 
 class Paid(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
@@ -102,9 +102,9 @@ def test_the_wrappers_find_what_follow_object_finds() -> None:
     def tip(env: Any) -> np.ndarray:
         return env.data.site("tip").xpos
 
-    env_id = FollowObject("Paid-v0", effector=tip, **TINY).env_id
+    env_id = bare_run("Paid-v0", effector=tip, **TINY).env_id
     reaching = ReachFirstWrapper(gym.make(env_id))
-    expected = FollowObject("Paid-v0", effector=tip, **TINY, reach={}).settings["reach"]
+    expected = bare_run("Paid-v0", effector=tip, **TINY, reach={}).settings["reach"]
     found = reaching.reach_settings()
     assert tuple(found.effector) == tuple(expected["effector"]) == (21, 22, 23)
     assert found.max_steps == expected["max_steps"] == 25
@@ -147,13 +147,11 @@ def test_reaching_takes_what_a_task_of_others_says_of_it() -> None:
 
     for imagine in (True, False):
         settings = {**TINY, "imagine": imagine, "reach": {}}
-        known = FollowObject(ARM, **settings).settings["reach"]
+        known = bare_run(ARM, **settings).settings["reach"]
         assert (known["effector"], known["max_steps"]) == ((0, 1, 2), 25)
-        slow = FollowObject(make_env=long, effector=elbow, **settings).settings["reach"]
+        slow = bare_run(make_env=long, effector=elbow, **settings).settings["reach"]
         assert (slow["effector"], slow["max_steps"]) == ((21, 22, 23), 60)
-    given = FollowObject(
-        make_env=long, **{**TINY, "reach": {"max_steps": 7, "effector": [3, 4, 5]}}
-    )
+    given = bare_run(make_env=long, **{**TINY, "reach": {"max_steps": 7, "effector": [3, 4, 5]}})
     assert given.settings["reach"]["max_steps"] == 7
     assert tuple(given.settings["reach"]["effector"]) == (3, 4, 5)
 
@@ -171,8 +169,8 @@ def test_a_robot_whose_place_is_not_told_cannot_reach_and_may_be_told() -> None:
         return TimeLimit(Scaled(), 50)
 
     with pytest.raises(ValueError, match="no part of the robot has its position in metres"):
-        FollowObject(make_env=scaled, **TINY, reach={})
-    told = FollowObject(
+        bare_run(make_env=scaled, **TINY, reach={})
+    told = bare_run(
         make_env=scaled, effector=lambda env: env.data.site("tip").xpos, **TINY, reach={}
     )
     assert told.settings["reach"]["effector"] == (21, 22, 23)
@@ -185,7 +183,7 @@ def test_an_object_that_does_not_learn_on_its_surface_may_leave_it(
     settings = {**TINY, "object_timesteps": 1200}
     states: list[dict[str, Any]] = []
     said: list[str] = []
-    run = FollowObject(ARM, report=said.append, **settings)
+    run = bare_run(ARM, report=said.append, **settings)
     stage = run.object_stage
     predictor = stage.learn_predictor(keeping(states))
     assert stage.on_table is False and predictor.object_on_table is False
@@ -193,7 +191,7 @@ def test_an_object_that_does_not_learn_on_its_surface_may_leave_it(
     assert sum("may leave it from here on" in sentence for sentence in said) == 1
     # On from a checkpoint of the first trial, and of the second.
     for state in (states[0], states[-2]):
-        again = FollowObject(ARM, report=quiet, **settings).object_stage
+        again = bare_run(ARM, report=quiet, **settings).object_stage
         resumed = again.learn_predictor(state=state)
         assert again.policy_steps == stage.policy_steps
         np.testing.assert_array_equal(resumed.error_mm, predictor.error_mm)
@@ -210,13 +208,13 @@ def test_an_object_that_learned_on_is_kept_whatever_its_last_tests_say(
     train = stages.train_object_policy
     monkeypatch.setattr(stages, "train_object_policy", learned_on)
     monkeypatch.setattr(stages, "SURFACE_STEPS", 400)
-    stage = FollowObject(ARM, report=quiet, **{**TINY, "object_timesteps": 1200}).object_stage
+    stage = bare_run(ARM, report=quiet, **{**TINY, "object_timesteps": 1200}).object_stage
     stage.learn_policy()
     assert stage.on_table is True and stage.policy_steps == 400
 
 
 def test_sldr_is_refused_before_the_object_learns() -> None:
-    run = FollowObject(ARM, **{**TINY, "algorithm": {**SMALL_NET, "auxiliary": {"name": "sldr"}}})
+    run = bare_run(ARM, **{**TINY, "algorithm": {**SMALL_NET, "auxiliary": {"name": "sldr"}}})
     with pytest.raises(ValueError, match="needs a robot task of this package"):
         run.check()
 
@@ -233,7 +231,7 @@ def test_a_folders_predictor_may_be_of_paths_of_ones_own(tmp_path: Path) -> None
 def test_a_wall_that_stands_elsewhere_in_each_episode_is_seen_in_all_stages(tmp_path: Path) -> None:
     replay = {"replay_buffer_kwargs": {"imagined_ratio": 0.5}}
     settings = {**TINY, "n_envs": 4, "n_threads": 2, "algorithm": {**SMALL_NET, **replay}}
-    run = FollowObject(moving_wall.WALL, **settings).learn(1800)
+    run = bare_run(moving_wall.WALL, **settings).learn(1800)
     assert run.predictor is not None and run.predictor.context == ("wall x", "wall y")
     assert run.model is not None and run.model.replay_buffer is not None
     walls = run.model.replay_buffer.contexts[: run.model.replay_buffer.pos]  # type: ignore[attr-defined]
@@ -280,9 +278,9 @@ def test_an_id_has_one_predictor_with_a_module_before_it_and_without(
     found = (tmp_path / "cache").rglob(FACTS_FILE)
     assert list(found) == [tmp_path / "cache" / ARM / kept_as(ARM) / FACTS_FILE]
     for env_id in (full_id, ARM):
-        assert FollowObject(env_id, predictor=predictor, **TINY).predictor is predictor
+        assert bare_run(env_id, predictor=predictor, **TINY).predictor is predictor
     with pytest.raises(ValueError, match=f"was made for {ARM} .* not for {moving_wall.WALL} "):
-        FollowObject(f"moving_wall:{moving_wall.WALL}", predictor=predictor, **TINY)
+        bare_run(f"moving_wall:{moving_wall.WALL}", predictor=predictor, **TINY)
 
 
 @pytest.mark.parametrize(
@@ -294,13 +292,13 @@ def test_an_id_has_one_predictor_with_a_module_before_it_and_without(
 )
 def test_what_cannot_be_meant_is_refused(arguments: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        FollowObject(ARM, **TINY, **arguments)
+        bare_run(ARM, **TINY, **arguments)
 
 
 def test_lift_is_the_users_word() -> None:
-    assert FollowObject(ARM, **TINY, lift=True).object_stage._choices() == (False,)
-    assert FollowObject(ARM, **TINY, lift=False).object_stage._choices() == (True,)
-    assert FollowObject(ARM, **TINY).object_stage._choices() == (True, False)
+    assert bare_run(ARM, **TINY, lift=True).object_stage._choices() == (False,)
+    assert bare_run(ARM, **TINY, lift=False).object_stage._choices() == (True,)
+    assert bare_run(ARM, **TINY).object_stage._choices() == (True, False)
 
 
 class Near(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
@@ -352,11 +350,11 @@ def test_an_object_that_learns_on_may_take_more_than_a_surface_is_given(
     settings = {**TINY, "object_timesteps": 1200, **rough, **often}
     said: list[str] = []
     states: list[dict[str, Any]] = []
-    stage = FollowObject(ARM, report=said.append, **settings).object_stage
+    stage = bare_run(ARM, report=said.append, **settings).object_stage
     predictor = stage.learn_predictor(keeping(states))
     (steps,) = [int(s.split(" for ")[1].split()[0]) for s in said if "the object learns on" in s]
     assert steps > 600 and stage.on_table is True
     assert states[-1]["model"]["counters"]["num_timesteps"] > 600
-    again = FollowObject(ARM, report=quiet, **settings).object_stage
+    again = bare_run(ARM, report=quiet, **settings).object_stage
     resumed = again.learn_predictor(state=states[-1])
     np.testing.assert_array_equal(resumed.error_mm, predictor.error_mm)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from tiny_runs import bare_run
 
 from sb3_follow_object.common.seeds import stream_seed
 from sb3_follow_object.envs import make_vec, physics_id
@@ -16,6 +17,7 @@ from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.runs.evaluation import evaluate
 from sb3_follow_object.runs.experiment import train
+from sb3_follow_object.settings.methods import METHODS
 from sb3_follow_object.settings.presets import run_config
 from sb3_follow_object.settings.run_config import RunConfig
 
@@ -42,7 +44,7 @@ STEPS_AFTER_OBJECT = 1200
 
 @pytest.fixture(scope="module")
 def predictor() -> GoalPredictor:
-    run = FollowObject(ENV, **TINY)
+    run = bare_run(ENV, **TINY)
     made = run.object_stage.learn_predictor()
     assert run.object_steps >= 1600
     run.close()
@@ -55,7 +57,7 @@ def weights(run: FollowObject) -> np.ndarray:
 
 
 def test_learn_counts_every_step(predictor: GoalPredictor) -> None:
-    run = FollowObject(ENV, predictor=predictor, **TINY)
+    run = bare_run(ENV, predictor=predictor, **TINY)
     run.learn(STEPS_AFTER_OBJECT)
     assert run.env_steps >= STEPS_AFTER_OBJECT
     assert run.curriculum.k_max > 2
@@ -71,7 +73,7 @@ def test_learn_counts_every_step(predictor: GoalPredictor) -> None:
 def test_same_seed_same_weights(predictor: GoalPredictor) -> None:
     results = []
     for seed in (0, 0, 1):
-        run = FollowObject(ENV, predictor=predictor, seed=seed, **TINY)
+        run = bare_run(ENV, predictor=predictor, seed=seed, **TINY)
         run.learn(600)
         results.append(weights(run))
     np.testing.assert_array_equal(results[0], results[1])
@@ -81,7 +83,7 @@ def test_same_seed_same_weights(predictor: GoalPredictor) -> None:
 def test_threads_do_not_change_the_result(predictor: GoalPredictor) -> None:
     results = []
     for n_threads in (1, 2):
-        run = FollowObject(ENV, predictor=predictor, **{**TINY, "n_threads": n_threads})
+        run = bare_run(ENV, predictor=predictor, **{**TINY, "n_threads": n_threads})
         run.learn(600)
         results.append(weights(run))
         run.close()
@@ -93,9 +95,9 @@ def test_resumed_equals_uninterrupted(
     predictor: GoalPredictor, imagine: bool, tmp_path: Path
 ) -> None:
     settings = {**TINY, "imagine": imagine, "predictor": predictor if imagine else None}
-    whole = FollowObject(ENV, **settings)
+    whole = bare_run(ENV, **settings)
     whole.learn(600)
-    part = FollowObject(ENV, **settings)
+    part = bare_run(ENV, **settings)
     part.learn(300)
     part.save(tmp_path / "run")
     part.close()
@@ -107,7 +109,7 @@ def test_resumed_equals_uninterrupted(
 
 
 def test_small_save_trains_on_from_empty_replay(predictor: GoalPredictor, tmp_path: Path) -> None:
-    run = FollowObject(ENV, predictor=predictor, **TINY)
+    run = bare_run(ENV, predictor=predictor, **TINY)
     run.learn(600)
     run.save(tmp_path / "run", replay_buffer=False)
     loaded = FollowObject.load(tmp_path / "run")
@@ -125,15 +127,15 @@ def test_save_replaces_everything_of_an_earlier_one(
     predictor: GoalPredictor, tmp_path: Path
 ) -> None:
     settings = {**TINY, "predictor_fit": {"hidden": (8,), "epochs": 1}, "object_timesteps": 800}
-    other = FollowObject(ENV, seed=1, **settings).object_stage.learn_predictor()
+    other = bare_run(ENV, seed=1, **settings).object_stage.learn_predictor()
     start, goal, k = np.full((1, 3), 0.5), np.full((1, 3), 0.6), np.array([3])
     for each in (predictor, other):
-        run = FollowObject(ENV, predictor=each, **TINY)
+        run = bare_run(ENV, predictor=each, **TINY)
         run.save(tmp_path / "run")
         loaded = FollowObject.load(tmp_path / "run").predictor
         assert loaded is not None
         np.testing.assert_array_equal(loaded.predict(start, goal, k), each.predict(start, goal, k))
-    FollowObject(ENV, imagine=False, **TINY).save(tmp_path / "run")
+    bare_run(ENV, imagine=False, **TINY).save(tmp_path / "run")
     assert FollowObject.load(tmp_path / "run").predictor is None
 
 
@@ -141,7 +143,7 @@ def test_save_leaves_a_runs_folder_alone(tmp_path: Path) -> None:
     (tmp_path / "predictor").mkdir()
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(ValueError, match="is the folder of a run; save into another one"):
-        FollowObject(ENV, imagine=False, **TINY).save(tmp_path)
+        bare_run(ENV, imagine=False, **TINY).save(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"predictor", "config.json"}
 
 
@@ -149,7 +151,7 @@ def test_save_keeps_train_freq_and_refuses_python_objects(
     predictor: GoalPredictor, tmp_path: Path
 ) -> None:
     algorithm = {**TINY["algorithm"], "train_freq": (1, "episode")}
-    run = FollowObject(ENV, predictor=predictor, **{**TINY, "algorithm": algorithm})
+    run = bare_run(ENV, predictor=predictor, **{**TINY, "algorithm": algorithm})
     run.learn(300)
     run.save(tmp_path / "run")
     loaded = FollowObject.load(tmp_path / "run")
@@ -157,7 +159,7 @@ def test_save_keeps_train_freq_and_refuses_python_objects(
 
     kwargs = {"policy_kwargs": {"activation_fn": th.nn.Tanh}}
     with pytest.warns(UserWarning, match=r"activation_fn is .* a Python object, which save"):
-        run = FollowObject(ENV, imagine=False, **{**TINY, "algorithm": kwargs})
+        run = bare_run(ENV, imagine=False, **{**TINY, "algorithm": kwargs})
     with pytest.raises(ValueError, match=r"activation_fn is .* a Python object, which save"):
         run.save(tmp_path / "none")
     assert not (tmp_path / "none").exists()
@@ -170,7 +172,7 @@ def test_function_is_a_callback(predictor: GoalPredictor) -> None:
         calls.append(1)
         return True
 
-    FollowObject(ENV, predictor=predictor, **TINY).learn(300, callback=count)
+    bare_run(ENV, predictor=predictor, **TINY).learn(300, callback=count)
     assert calls
 
 
@@ -218,7 +220,7 @@ def test_run_folder_resumes_and_is_evaluated_again(
 
 def test_predictor_for_another_task_is_refused(predictor: GoalPredictor, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="was made for FollowObject/PushSideGap-v0"):
-        FollowObject("FollowObject/PnPShelf-v0", predictor=predictor)
+        bare_run("FollowObject/PnPShelf-v0", predictor=predictor)
     predictor.save(tmp_path / "predictor")
     assert GoalPredictor.load(tmp_path / "predictor").physics == physics_id(ENV)
 
@@ -239,7 +241,7 @@ def test_predictor_for_another_task_is_refused(predictor: GoalPredictor, tmp_pat
 )
 def test_bad_input_is_one_sentence(arguments: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence) as error:
-        FollowObject(**{"env_id": ENV, **arguments})
+        bare_run(**{"env_id": ENV, **arguments})
     assert "\n" not in str(error.value)
 
 
@@ -267,39 +269,69 @@ def test_streams_of_a_run_are_unrelated() -> None:
 
 @pytest.mark.parametrize("method", ["her", "shaped"])
 def test_preset_learns_what_the_run_folder_learns(method: str, tmp_path: Path) -> None:
-    small = {"n_envs": 2, "n_threads": 1, "batch_size": 16, "gradient_steps": 2}
-    small |= {"buffer_size": 2000, "learning_starts": 200, "policy_kwargs.net_arch": [8]}
-    config = run_config(ENV, method=method, seed=5, overrides=small)
+    small = {"batch_size": 16, "gradient_steps": 2, "buffer_size": 2000, "learning_starts": 200}
+    copies, net = {"n_envs": 2, "n_threads": 1}, [8]
+    changes = {**copies, **small, "policy_kwargs.net_arch": net}
+    config = run_config(ENV, method=method, seed=5, overrides=changes)
     train(replace(config, total_timesteps=600, n_final_episodes=1), tmp_path / "run", report=print)
-    run = FollowObject.from_preset(ENV, method=method, seed=5, overrides=small)
+    algorithm = {**small, "policy_kwargs": {"net_arch": net}}
+    run = FollowObject(ENV, method=method, seed=5, algorithm=algorithm, **copies)
     run.learn(600)
     run.save_policy(tmp_path / "policy.safetensors")
     ours, theirs = tmp_path / "policy.safetensors", tmp_path / "run" / "policy.safetensors"
     assert ours.read_bytes() == theirs.read_bytes()
 
 
-def test_preset_refuses_what_train_refuses() -> None:
-    with pytest.raises(ValueError, match="did you mean 'batch_size'"):
-        FollowObject.from_preset(ENV, overrides={"batchsize": 3})
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("env_id", [ENV, "FollowObject/PnPInsertion-v0"])
+def test_without_settings_it_has_those_of_train(env_id: str, method: str) -> None:
+    settings = FollowObject(env_id, method=method).settings
+    for name, value in run_config(env_id, method=method).settings.items():
+        assert settings[name] == value, name
 
 
-@pytest.mark.parametrize("name", ["n_envs", "imagine"])
-def test_preset_takes_settings_as_overrides_alone(name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name} is a setting: give overrides"):
-        FollowObject.from_preset(ENV, **{name: 1})
+def test_what_is_given_of_a_mapping_leaves_the_rest_to_the_preset() -> None:
+    preset = FollowObject(ENV).settings
+    algorithm = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}
+    ours = FollowObject(ENV, algorithm=algorithm, curriculum={"p": 0.5}, reach=None).settings
+    assert "reach" in preset and "reach" not in ours
+    assert ours["curriculum"] == {**preset["curriculum"], "p": 0.5}
+    policy = {**preset["algorithm"]["policy_kwargs"], "net_arch": [8]}
+    assert ours["algorithm"] == {
+        **preset["algorithm"],
+        "batch_size": 16,
+        "policy_kwargs": policy,
+    }
+    assert "n_levels" not in FollowObject(ENV, preset=None).settings["curriculum"]
 
 
-@pytest.mark.parametrize("name", ["n_timesteps", "solved_at"])
-def test_preset_refuses_what_only_a_run_folder_has(name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name} is of a run folder"):
-        FollowObject.from_preset(ENV, overrides={name: 1})
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"n_env": 3}, "did you mean 'n_envs'"),
+        ({"algorithm": {"batchsize": 3}}, "did you mean 'batch_size'"),
+        ({"batch_size": 3}, r"of the robot's algorithm: algorithm={'batch_size': \.\.\.}"),
+        ({"n_timesteps": 3}, "n_timesteps is of a run folder"),
+        ({"solved_at": 0.5}, "solved_at is of a run folder"),
+        ({"imagine": False}, "the method says whether goals are imagined"),
+        ({"method": "her", "preset": None}, "method='her' is a preset's to know"),
+        ({"method": "herr"}, "did you mean 'her'"),
+        ({"preset": "papers"}, "did you mean 'paper'"),
+        ({"method": "rher", "preset": "paper"}, "'rher' has no preset 'paper'"),
+    ],
+)
+def test_what_is_said_in_the_wrong_place_is_one_sentence(
+    arguments: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        FollowObject(ENV, **arguments)
 
 
 @pytest.mark.parametrize("steps", [300_000.0, -1, "many"])
 def test_wrong_steps_are_refused_before_the_object_learns(
     steps: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = FollowObject(ENV, **TINY)
+    run = bare_run(ENV, **TINY)
     monkeypatch.setattr(run.object_stage, "learn_predictor", lambda: pytest.fail("it learns"))
     with pytest.raises(ValueError, match="total_timesteps"):
         run.learn(steps)
@@ -307,7 +339,7 @@ def test_wrong_steps_are_refused_before_the_object_learns(
 
 def test_steps_that_end_with_the_objects_stage_are_told() -> None:
     said: list[str] = []
-    run = FollowObject(ENV, **TINY, report=said.append).learn(1000)
+    run = bare_run(ENV, **TINY, report=said.append).learn(1000)
     assert run.object_steps >= 1600
     assert run.env_steps == run.object_steps
     assert said[-1].endswith(
@@ -327,7 +359,7 @@ def test_steps_that_end_with_the_objects_stage_are_told() -> None:
 def test_a_save_is_loaded_for_its_own_environment(
     environment: dict[str, Any], sentence: str, predictor: GoalPredictor, tmp_path: Path
 ) -> None:
-    FollowObject(ENV, predictor=predictor, **TINY).save(tmp_path / "save")
+    bare_run(ENV, predictor=predictor, **TINY).save(tmp_path / "save")
     with pytest.raises(ValueError, match=sentence):
         FollowObject.load(tmp_path / "save", **environment)
     assert FollowObject.load(tmp_path / "save", env_id=ENV).env_id == ENV
@@ -352,8 +384,8 @@ def test_wrong_settings_are_refused_before_the_object_learns(
     settings: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(ValueError, match=sentence):
-        FollowObject(ENV, **{**TINY, **settings}, report=pytest.fail).learn(2000)  # type: ignore
+        bare_run(ENV, **{**TINY, **settings}, report=pytest.fail).learn(2000)  # type: ignore
 
 
 def test_an_id_may_name_its_module() -> None:
-    assert FollowObject(f"sb3_follow_object:{ENV}", **TINY).env_id == ENV
+    assert bare_run(f"sb3_follow_object:{ENV}", **TINY).env_id == ENV

@@ -12,6 +12,7 @@ import tiny_runs as runs
 import torch as th
 from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 from tiny import TASK, cache_predictor
+from tiny_runs import bare_run
 
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
@@ -35,7 +36,7 @@ def predictor(tmp_path_factory: pytest.TempPathFactory) -> GoalPredictor:
 
 def robot(predictor: GoalPredictor | None, **settings: Any) -> FollowObject:
     tiny = {**runs.TINY, "reach": REACH, **settings}
-    return FollowObject(TASK, imagine=predictor is not None, predictor=predictor, **tiny)
+    return bare_run(TASK, imagine=predictor is not None, predictor=predictor, **tiny)
 
 
 def outcome(run: FollowObject) -> dict[str, Any]:
@@ -90,7 +91,7 @@ def test_one_seed_one_result_and_threads_change_nothing(predictor: GoalPredictor
 
 
 def test_without_it_nothing_is_wrapped_and_none_is_as_nothing(predictor: GoalPredictor) -> None:
-    plain = FollowObject(TASK, predictor=predictor, **runs.TINY).learn(600)
+    plain = bare_run(TASK, predictor=predictor, **runs.TINY).learn(600)
     off, never = robot(predictor, reach=None).learn(600), robot(predictor, reach={"share": 0.0})
     assert plain.settings == off.settings and "reach" not in off.settings
     assert wrapper_of(plain) is None and plain.reach_callback is None
@@ -155,7 +156,7 @@ def test_standoff_is_the_tasks_unless_it_is_given(
     env_id: str, on_table: bool | None, reach: dict[str, Any], metres: float
 ) -> None:
     tiny = {**runs.TINY, "imagine": False, "object_on_table": on_table, "reach": reach}
-    run = FollowObject(env_id, **tiny)
+    run = bare_run(env_id, **tiny)
     run.prepare()
     reaching = wrapper_of(run)
     assert reaching is not None and reaching.reach_settings().standoff == metres
@@ -173,12 +174,12 @@ def test_standoff_is_the_tasks_unless_it_is_given(
 )
 def test_bad_settings_are_one_sentence(reach: Any, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        FollowObject(TASK, reach=reach)
+        bare_run(TASK, reach=reach)
 
 
 def test_an_effector_that_is_not_there_is_refused_before_the_object_learns() -> None:
     told: list[str] = []
-    run = FollowObject(TASK, **{**runs.TINY, "reach": {"effector": [90, 91, 92]}})
+    run = bare_run(TASK, **{**runs.TINY, "reach": {"effector": [90, 91, 92]}})
     run.object_stage.report = told.append
     with pytest.raises(ValueError, match=r"effector is \[90, 91, 92\].*must hold the effector's"):
         run.learn(2000)

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from kept_states import keeping
-from tiny_runs import TASK, TINY
+from tiny_runs import TASK, TINY, bare_run
 
-from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.object_stage.stage import ObjectStage
 
 SETTINGS: dict[str, Any] = {
@@ -26,7 +25,7 @@ PATHS = 8 * 50
 
 def stage(error: float, said: list[str] | None = None, **settings: Any) -> ObjectStage:
     report = None if said is None else said.append
-    run = FollowObject(TASK, report=report, object_error=error, **{**SETTINGS, **settings})
+    run = bare_run(TASK, report=report, object_error=error, **{**SETTINGS, **settings})
     return run.object_stage
 
 

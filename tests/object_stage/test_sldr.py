@@ -12,6 +12,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tiny import TASK, cache_networks, cache_predictor, tiny_networks
+from tiny_runs import bare_run
 from toy import HORIZON, PointEnv
 
 from sb3_follow_object.callbacks.rollout import run_episodes
@@ -27,7 +28,6 @@ from sb3_follow_object.envs import (
     object_state,
     physics_id,
 )
-from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.object_stage.networks import ACTION, FILE, OBSERVATION, ObjectNetworks
 from sb3_follow_object.object_stage.sldr import SldrReward
 from sb3_follow_object.runs import predictor_cache
@@ -305,10 +305,10 @@ def test_other_environments_and_other_tasks_networks_are_refused(tmp_path: Path)
 def test_run_needs_the_networks_of_its_object_stage() -> None:
     algorithm = {"auxiliary": {"name": "sldr"}}
     with pytest.raises(ValueError, match="were made for env_id"):
-        FollowObject("FollowObject/PnPShelf-v0", object_networks=tiny_networks())
+        bare_run("FollowObject/PnPShelf-v0", object_networks=tiny_networks())
     with pytest.raises(ValueError, match="give FollowObject object_networks instead"):
-        FollowObject(TASK, algorithm={"auxiliary": {"name": "sldr", "object_networks": "x"}})
-    run = FollowObject(TASK, algorithm=algorithm, imagine=False, n_envs=1)
+        bare_run(TASK, algorithm={"auxiliary": {"name": "sldr", "object_networks": "x"}})
+    run = bare_run(TASK, algorithm=algorithm, imagine=False, n_envs=1)
     assert run.has_object_stage
     run.close()
 

@@ -14,7 +14,7 @@ import pytest
 from small_buffers import make_buffer, make_env
 from small_models import make_model
 from stable_baselines3 import DDPG
-from tiny_runs import TINY
+from tiny_runs import TINY, bare_run
 from toy import HORIZON
 
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
@@ -69,7 +69,6 @@ TAKEN_BY: dict[type[Group], Callable[..., Any]] = {
     InverseSettings: ObjectNetworks.learned,
     CurriculumSettings: Curriculum.__init__,
     CurriculumTestSettings: CurriculumCallback.__init__,
-    StageSettings: FollowObject.__init__,
     RunConfig: RunConfig.__init__,
 }
 ALL = [*GROUPS, CurriculumTestSettings]
@@ -150,7 +149,7 @@ def test_a_run_full_of_numpys_numbers_can_be_saved(tmp_path: Path) -> None:
     assert config.settings == json.loads(json.dumps(config.settings))
     small = {"batch_size": np.int64(16), "policy_kwargs": {"net_arch": [np.int64(8)]}}
     small["replay_buffer_kwargs"] = {"moved_ratio": np.float32(0.5), "seed": np.int64(1)}
-    stages = FollowObject(
+    stages = bare_run(
         TASK,
         imagine=np.bool_(False),  # type: ignore[arg-type]
         n_envs=np.int64(2),  # type: ignore[arg-type]

@@ -17,6 +17,7 @@ from small_buffers import as_arrays, fill, make_buffer, make_env
 from small_models import make_model, weights
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor
 from tiny import tiny_networks
+from tiny_runs import bare_run
 
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
 from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
@@ -321,7 +322,7 @@ def follow_object() -> FollowObject:
     longer = np.concatenate([paths, np.repeat(paths[:, -1:], 40, axis=1)], axis=1)
     facts = {"env_id": PUSH, "physics": physics_id(PUSH)}
     predictor = GoalPredictor.fit(longer, goals, hidden=[8], epochs=1, **facts)  # type: ignore[arg-type]
-    run = FollowObject(
+    run = bare_run(
         PUSH,
         predictor=predictor,
         n_envs=2,
