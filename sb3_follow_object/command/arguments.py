@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-from ..settings.methods import who_trains
 
 # Nothing heavier here: --help must not wait for torch.
 
@@ -51,13 +49,6 @@ def check_agreed(flag: str, given: int | None, said: Mapping[str, Any]) -> None:
         raise ValueError(
             f"--{flag.replace('_', '-')} is {given}, but --set says {others}; give one of them"
         )
-
-
-def check_methods(names: Sequence[str]) -> None:
-    """Raise a ValueError for a method that another program trains."""
-    for name in names:
-        if who := who_trains(name):
-            raise ValueError(f"there is no method {name!r}; {who}")
 
 
 def policy_of(run: Path) -> Path:

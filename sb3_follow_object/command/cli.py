@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.reports import Trouble, reason
+from ..settings.methods import check_methods
 from . import demo, export, picture, report
-from .arguments import check_agreed, check_methods, overrides_of, policy_of
+from .arguments import check_agreed, overrides_of, policy_of
 from .cli_options import PROGRAM, USER_ERROR, make_parser
 from .picture_names import CURVE, IMAGINED, TASK, VIDEO
 from .streams import leave_streams, open_streams

@@ -28,7 +28,7 @@ from ..zoo_configs import FOLDER
 from .fields import Group, Setting, check_names, settings_of
 from .learning import AlgorithmSettings, check_auxiliary
 from .methods import METHODS as METHODS
-from .methods import WITHOUT_PAPER, who_trains
+from .methods import STOCK, WITHOUT_PAPER, check_methods
 from .run_config import CONFIG, RunConfig
 from .sizes import check_sizes
 from .stages import ReachFirstSettings, ReachTeachingSettings, StageSettings, part_of_reach
@@ -66,14 +66,19 @@ _GROUPS: tuple[type[Group], ...] = (RunConfig, StageSettings, AlgorithmSettings)
 
 
 def preset_file(method: str, preset: str = "default") -> Path:
-    """Return the YAML file of a method that comes with the package.
+    """Return the YAML file that comes with the package for a method or a stock algorithm.
+
+    Args:
+        method: one of `METHODS`, or "ddpg", "td3", "sac" or "tqc", whose files rl_zoo3 reads.
+        preset: "default" or "paper".
 
     Raises:
         ValueError: there is no such method or preset, with the nearest that there is.
     """
+    if method in STOCK and preset == "default":
+        return FOLDER / STOCK[method]
     if method not in METHODS:
-        meant = f"; {who}" if (who := who_trains(str(method))) else did_you_mean(method, METHODS)
-        raise ValueError(f"there is no method {method!r}{meant}")
+        raise ValueError(f"there is no method {method!r}{did_you_mean(method, METHODS)}")
     if preset not in PRESETS:
         raise ValueError(f"there is no preset {preset!r}{did_you_mean(preset, PRESETS)}")
     if method in WITHOUT_PAPER and preset == "paper":
@@ -113,6 +118,7 @@ def run_config(
     env_id = name if name in IDS else env_id
     if file is None:
         method = method or "fo"
+        check_methods([method])
         path = preset_file(method, preset)
     else:
         path = Path(file)

@@ -15,7 +15,7 @@ import yaml
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import IDS
 from sb3_follow_object.runs.run_folder import difference
-from sb3_follow_object.settings.methods import METHODS, WITHOUT_PAPER
+from sb3_follow_object.settings.methods import METHODS, STOCK, WITHOUT_PAPER
 from sb3_follow_object.settings.presets import (
     CALLBACK,
     OF_RUNS,
@@ -33,6 +33,27 @@ TASK = "FollowObject/PushSideGap-v0"
 ROBOTS = [env_id for env_id, (_, alone) in IDS.items() if not alone]
 PAIRS = [(m, p) for m in METHODS for p in PRESETS if p != "paper" or m not in WITHOUT_PAPER]
 FILES = [preset_file(*pair) for pair in PAIRS]
+
+
+@pytest.mark.parametrize("algorithm", STOCK)
+def test_stock_algorithms_have_files_too(algorithm: str) -> None:
+    assert preset_file(algorithm).is_file()
+    with pytest.raises(ValueError, match=r"there is no method .*rl_zoo3 trains stock algorithms"):
+        run_config(TASK, method=algorithm)
+
+
+@pytest.mark.parametrize(
+    ("names", "sentence"),
+    [
+        (("herr",), "there is no method 'herr'; did you mean 'her'"),
+        (("her", "papers"), "there is no preset 'papers'; did you mean 'paper'"),
+        (("ddpg", "paper"), "there is no method 'ddpg'"),
+        (("rher", "paper"), "'rher' has no preset 'paper'"),
+    ],
+)
+def test_a_file_that_does_not_come_with_the_package(names: tuple[str, ...], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        preset_file(*names)
 
 
 def write(path: Path, entry: dict[str, Any], env_id: str = TASK) -> Path:
