@@ -38,7 +38,8 @@ from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import make_vec
 from sb3_follow_object.envs.robot_copies import robot_vec_env
 from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
-from sb3_follow_object.settings.presets import preset_file, read_yaml
+from sb3_follow_object.settings.presets import preset_file
+from sb3_follow_object.settings.zoo_yaml import read_yaml
 
 HERE = Path(__file__).parent
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

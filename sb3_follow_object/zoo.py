@@ -18,7 +18,8 @@ from typing import Any
 from .common.extras import need
 from .ddpg.her_ddpg import HerDDPG
 from .settings.fields import check_names
-from .settings.presets import preset_file, read_yaml
+from .settings.presets import preset_file
+from .settings.zoo_yaml import read_yaml
 
 ALGORITHM = "her_ddpg"
 COMMANDS = ("train", "enjoy", "record_video", "load_from_hub", "push_to_hub")

@@ -6,7 +6,7 @@ from gymnasium import spaces
 
 from ..common.mirrors import Mirror, as_mirrors
 from ..zoo_configs import FOLDER
-from .presets import read_yaml
+from .zoo_yaml import read_yaml
 
 PLANES = FOLDER / "mirrors.yml"
 

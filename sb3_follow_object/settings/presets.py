@@ -25,14 +25,15 @@ from ..envs.registration import import_task
 from ..envs.task_table import BUILT_IN
 from ..envs.tasks import SUCCESS_DISTANCE
 from ..zoo_configs import FOLDER
-from .fields import Group, Setting, check_names, settings_of
+from .fields import Group, check_names
 from .learning import AlgorithmSettings, check_auxiliary
 from .methods import METHODS as METHODS
 from .methods import STOCK, WITHOUT_PAPER, check_methods
 from .run_config import CONFIG, RunConfig
 from .sizes import check_sizes
-from .stages import ReachFirstSettings, ReachTeachingSettings, StageSettings, part_of_reach
+from .stages import ReachTeachingSettings, StageSettings
 from .table import check_dotted
+from .zoo_yaml import SIMILAR, WRAPPER, ZooFile, of_data, with_numbers
 
 PRESETS = ("default", "paper")
 # Settings in metres that are meant as shares of the distance within which goals are reached.
@@ -43,24 +44,12 @@ _TOLERANCES = (
     ("replay_buffer_kwargs", "scene_distance"),
 )
 _HORIZON = 50  # steps of the episodes that presets give updates and tests for
-# The package's task that one of one's own is set up as, by whether its object is pushed.
-SIMILAR = {True: "FollowObject/PushSideGap-v0", False: "FollowObject/PnPSimpleV2-v0"}
-
-WRAPPER = "sb3_follow_object.ImaginedGoalWrapper"
-CALLBACK = "sb3_follow_object.CurriculumCallback"
-OF_RUNS = "sb3-follow-object"  # an entry for all tasks that rl_zoo3 does not look at
-REACH_WRAPPER = "sb3_follow_object.ReachFirstWrapper"
-REACH_CALLBACK = "sb3_follow_object.ReachCallback"
-_KNOWN = {"env_wrapper": (WRAPPER, REACH_WRAPPER), "callback": (CALLBACK, REACH_CALLBACK)}
 # What makes an entry this or that method.
 _MARKS = (
     f"fo has env_wrapper {WRAPPER}, shaped reward_type dense, cher a setting "
     "replay_buffer_kwargs.cher, the auxiliary reward gives its name, and rher has none of these "
     "but settings of reach"
 )
-# The callback's keyword arguments, and what FollowObject calls them.
-_CALLBACK_NAMES = {"every": "test_every", "n_episodes": "n_test_episodes", "store": "store_tests"}
-
 # Whose settings stand side by side in an entry.
 _GROUPS: tuple[type[Group], ...] = (RunConfig, StageSettings, AlgorithmSettings)
 
@@ -119,32 +108,12 @@ def run_config(
     if file is None:
         method = method or "fo"
         check_methods([method])
-        path = preset_file(method, preset)
-    else:
-        path = Path(file)
-    entries = read_yaml(path)
-    entry = _entry(entries, env_id, path)
-    imagine = WRAPPER in _named(entry, "env_wrapper", path)
-    of_runs = _of_runs(entries, path)
-    settings = of_runs | _flattened(entry, path)
-    unknown = env_id not in IDS and not {env_id, env_id.rpartition(":")[2]} & entries.keys()
-    has_object_stage = imagine or _auxiliary_name(settings) == "sldr"
-    if has_object_stage and env_id not in IDS:
-        if _auxiliary_name(settings) == "sldr":
-            raise ValueError(
-                f"{env_id!r} is not a task of this package, whose observations alone SLDR's reward "
-                "can read the object's state from; train it with --method fo or her"
-            )
-        check_followable(env_id)
-        if unknown:  # set up as the package's most similar task
-            if surface_choices(env_id)[0]:
-                settings = of_runs | _flattened(_entry(entries, SIMILAR[True], path), path)
-            _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
-    of_object = object_id(env_id if env_id in IDS else SIMILAR[False])
-    if has_object_stage and _find(entries, of_object) is not None:
-        settings |= _object_stage(_entry(entries, of_object, path), path)
+    path = preset_file(method or "fo", preset) if file is None else Path(file)
+    known = ZooFile(path)
+    imagine = known.imagines(env_id)
+    settings = _task_settings(known, env_id, imagine)
     ours = file is None and preset == "default"  # the paper's cycles are the paper's
-    if ours and unknown:
+    if ours and _is_unknown(known, env_id):
         _fit_to_horizon(settings, env_id)
     changes: dict[str, Any] = {}
     for name, value in (overrides or {}).items():
@@ -163,8 +132,8 @@ def run_config(
         )
 
     of_run, of_class, of_algorithm = (
-        {known[name].field: settings[name] for name in settings if name in known}
-        for known in map(_known, _GROUPS)
+        {group[name].field: settings[name] for name in settings if name in group}
+        for group in map(of_data, _GROUPS)
     )
     config = RunConfig(
         env_id,
@@ -180,6 +149,32 @@ def run_config(
     )
     check_sizes(config)
     return config
+
+
+def _is_unknown(known: ZooFile, env_id: str) -> bool:
+    """Whether neither the package nor a file of settings knows an environment."""
+    return env_id not in IDS and not known.names(env_id)
+
+
+def _task_settings(known: ZooFile, env_id: str, imagine: bool) -> dict[str, Any]:
+    """Return what a file says of a task, its object's stage included, as fits the task."""
+    settings = known.settings(env_id)
+    needs_networks = _auxiliary_name(settings) == "sldr"
+    if not (imagine or needs_networks):
+        return settings
+    if env_id in IDS:
+        return settings | known.object_settings(object_id(env_id))
+    if needs_networks:
+        raise ValueError(
+            f"{env_id!r} is not a task of this package, whose observations alone SLDR's reward "
+            "can read the object's state from; train it with --method fo or her"
+        )
+    check_followable(env_id)
+    if _is_unknown(known, env_id):  # set up as the package's most similar task
+        if surface_choices(env_id)[0]:
+            settings = known.settings(SIMILAR[True])
+        _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
+    return settings | known.object_settings(object_id(SIMILAR[False]))
 
 
 def method_of(settings: Mapping[str, Any], imagine: bool) -> str:
@@ -233,132 +228,9 @@ def parse_override(text: str) -> tuple[str, Any]:
     if not equals or not name:
         raise ValueError(f"{text!r} is no setting; write key=value or key.sub=value")
     try:
-        return name, _plain(load_yaml(value))
+        return name, with_numbers(load_yaml(value))
     except ValueError as error:
         raise ValueError(f"the value of {text!r} is not YAML: {error}") from error
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Return a YAML file's mapping of env ids to settings.
-
-    Raises:
-        ValueError: the file is missing, is not YAML, or is not such a mapping.
-    """
-    try:
-        entries = load_yaml(path.read_text("utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise ValueError(f"{path} is not YAML: {error}") from error
-    if not isinstance(entries, dict):
-        raise ValueError(f"{path} is not a mapping from environment ids to settings")
-    return entries
-
-
-def _entry(entries: dict[str, Any], env_id: str, path: Path) -> dict[str, Any]:
-    entry = _find(entries, env_id)
-    if entry is None:
-        entry = entries.get("default")
-    if entry is None:
-        raise ValueError(f"{path} has no settings for {env_id!r}{did_you_mean(env_id, entries)}")
-    if not isinstance(entry, dict):
-        raise ValueError(f"{path}: the settings of {env_id!r} are not a mapping")
-    return entry
-
-
-def _find(entries: dict[str, Any], env_id: str) -> Any:
-    """Return an id's entry; for a task of one's own, otherwise that of the most similar one."""
-    if env_id not in entries and env_id in IDS and env_id not in BUILT_IN:
-        task, alone = IDS[env_id]
-        env_id = SIMILAR[task.blocked_gripper]
-        env_id = object_id(env_id) if alone else env_id
-    return entries.get(env_id, entries.get(env_id.rpartition(":")[2]))
-
-
-def _named(entry: dict[str, Any], key: str, path: Path) -> dict[str, dict[str, Any]]:
-    """Return rl_zoo3's list of class names, each bare or with arguments, as one mapping."""
-    given = entry.get(key) or []
-    named: dict[str, dict[str, Any]] = {}
-    for item in given if isinstance(given, list) else [given]:
-        if isinstance(item, dict) and len(item) == 1:
-            ((name, arguments),) = item.items()
-            named[name] = arguments or {}
-        elif isinstance(item, str):
-            named[item] = {}
-        else:
-            raise ValueError(f"{path}: {key} must list class names with arguments, not {item!r}")
-    for name, arguments in named.items():
-        if name not in _KNOWN[key]:
-            raise ValueError(f"{path}: {key} can hold {' and '.join(_KNOWN[key])}, not {name!r}")
-        if not isinstance(arguments, dict):
-            raise ValueError(f"{path}: the arguments of {name} are not a mapping")
-    return named
-
-
-def _of_runs(entries: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the settings of all tasks that are a run's or the three stages', not rl_zoo3's."""
-    given = entries.get(OF_RUNS) or {}
-    if not isinstance(given, dict):
-        raise ValueError(f"{path}: the settings of {OF_RUNS!r} are not a mapping")
-    check_names(given, {**_known(RunConfig), **_known(StageSettings)}, f"{path}: {OF_RUNS}")
-    return dict(_plain(given))
-
-
-def _flattened(entry: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return an entry with the arguments of its wrapper, callback and environments as settings."""
-    settings = _plain(entry)
-    wrappers = _named(settings, "env_wrapper", path)
-    callbacks = _named(settings, "callback", path)
-    if WRAPPER in wrappers:
-        arguments = wrappers[WRAPPER]
-        check_names(arguments, ("predictor", "curriculum"), f"{path}: {WRAPPER}")
-        if arguments.get("predictor", "auto") != "auto":
-            raise ValueError(f"{path}: a run makes its own predictor; leave it out or say auto")
-        settings["curriculum"] = arguments.get("curriculum") or {}
-    if CALLBACK in callbacks:
-        arguments = callbacks[CALLBACK]
-        check_names(arguments, _CALLBACK_NAMES, f"{path}: {CALLBACK}")
-        settings |= {_CALLBACK_NAMES[name]: value for name, value in arguments.items()}
-    reach = _reach(wrappers.get(REACH_WRAPPER), callbacks.get(REACH_CALLBACK), path)
-    settings |= {} if reach is None else {"reach": reach}
-    env_kwargs = settings.get("env_kwargs") or {}
-    check_names(env_kwargs, ("reward_type",), f"{path}: env_kwargs")
-    settings |= env_kwargs
-    return {
-        name: value
-        for name, value in settings.items()
-        if name not in ("env_wrapper", "callback", "env_kwargs")
-    }
-
-
-def _reach(
-    first: dict[str, Any] | None, teaching: dict[str, Any] | None, path: Path
-) -> dict[str, Any] | None:
-    """Return the setting `reach` from the arguments of its wrapper and of its callback."""
-    if first is None and teaching is None:
-        return None
-    if first is None or teaching is None:
-        given, missing = REACH_CALLBACK, f"the env_wrapper {REACH_WRAPPER}"
-        if teaching is None:
-            given, missing = REACH_WRAPPER, f"the callback {REACH_CALLBACK}"
-        raise ValueError(f"{path}: {given} does nothing without {missing}; give both or neither")
-    return {
-        **part_of_reach(ReachTeachingSettings, teaching, f"{path}: {REACH_CALLBACK}"),
-        **part_of_reach(ReachFirstSettings, first, f"{path}: {REACH_WRAPPER}"),
-    }
-
-
-def _object_stage(entry: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the first stage's settings from the entry of the object's own environment."""
-    algorithm = _plain(entry)
-    algorithm.pop("policy", None)  # rl_zoo3 wants it; the first stage knows only one
-    settings: dict[str, Any] = {"object_algorithm": algorithm}
-    for name, ours in (("n_timesteps", "object_timesteps"), ("n_envs", "object_n_envs")):
-        if name in algorithm:
-            settings[ours] = algorithm.pop(name)
-    env_kwargs = algorithm.pop("env_kwargs", {})
-    check_names(env_kwargs, ("on_table",), f"{path}: env_kwargs of the object")
-    return settings | {f"object_{name}": value for name, value in env_kwargs.items()}
 
 
 def _scale_distances(settings: dict[str, Any], factor: float) -> None:
@@ -403,28 +275,8 @@ def _override(settings: dict[str, Any], name: str, value: Any) -> None:
     settings[last] = value
 
 
-def _known(group: type[Group]) -> dict[str, Setting]:
-    """Return what data can say of a group."""
-    return {name: each for name, each in settings_of(group).items() if each.data}
-
-
 def _checked(settings: dict[str, Any], where: str) -> dict[str, Any]:
     """Return an entry's settings as the groups have them."""
-    known = {name: each for group in _GROUPS for name, each in _known(group).items()}
+    known = {name: each for group in _GROUPS for name, each in of_data(group).items()}
     check_names(settings, known, where)
     return {name: known[name].checked(value, where, data=True) for name, value in settings.items()}
-
-
-def _plain(value: Any) -> Any:
-    """Read 1e-3, a word in YAML 1.1, as a number, and !!float 1e6 as the whole one it is."""
-    if isinstance(value, dict):
-        return {name: _plain(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return [_plain(inner) for inner in value]
-    if not isinstance(value, str | float):
-        return value
-    try:
-        number = float(value)
-    except ValueError:
-        return value
-    return int(number) if number.is_integer() else number

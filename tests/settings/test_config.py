@@ -17,16 +17,18 @@ from sb3_follow_object.envs import IDS
 from sb3_follow_object.runs.run_folder import difference
 from sb3_follow_object.settings.methods import METHODS, STOCK, WITHOUT_PAPER
 from sb3_follow_object.settings.presets import (
-    CALLBACK,
-    OF_RUNS,
     PRESETS,
-    REACH_CALLBACK,
-    REACH_WRAPPER,
-    WRAPPER,
     load_config,
     parse_override,
     preset_file,
     run_config,
+)
+from sb3_follow_object.settings.zoo_yaml import (
+    CALLBACK,
+    OF_RUNS,
+    REACH_CALLBACK,
+    REACH_WRAPPER,
+    WRAPPER,
 )
 
 TASK = "FollowObject/PushSideGap-v0"

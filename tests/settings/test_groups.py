@@ -55,6 +55,7 @@ from sb3_follow_object.settings.stages import (
     StageSettings,
 )
 from sb3_follow_object.settings.table import GROUPS, lines
+from sb3_follow_object.settings.zoo_yaml import WRAPPER
 
 ROOT = Path(__file__).parents[2]
 TASK = "FollowObject/PushSideGap-v0"
@@ -320,7 +321,7 @@ def test_distances_are_fitted_to_a_task_of_others_where_they_are_some(
     monkeypatch.setattr(presets, "check_followable", lambda env_id: None)
     monkeypatch.setattr(presets, "surface_choices", lambda env_id: (False,))
     monkeypatch.setattr(presets, "success_distance_of", lambda env_id: SUCCESS_DISTANCE / 2)
-    entry = {"env_wrapper": presets.WRAPPER, "replay_buffer_kwargs": {"moved_distance": given}}
+    entry = {"env_wrapper": WRAPPER, "replay_buffer_kwargs": {"moved_distance": given}}
     file = tmp_path / "my.yml"
     file.write_text(json.dumps({"default": entry}))
     try:
