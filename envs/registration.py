@@ -55,15 +55,18 @@ def import_task(env_id: str) -> str:
         env_id: gymnasium id, with "module:" before it where importing that module registers it.
 
     Raises:
-        ValueError: the module cannot be imported.
+        ValueError: it is no id, or the module cannot be imported.
     """
+    if not isinstance(env_id, str):
+        raise ValueError(f"{env_id!r} is no environment's id, which is text")
     module, _, name = env_id.rpartition(":")
     if module:
         try:
             import_module(module)
-        except (ImportError, TypeError, ValueError) as error:  # a relative name, an empty part
+        except Exception as error:  # a module of somebody's may raise anything
+            reason = str(error) or type(error).__name__
             raise ValueError(
-                f"{env_id!r} names a module that cannot be imported ({error}); "
+                f"{env_id!r} names a module that cannot be imported ({reason}); "
                 "is it installed, or its folder on PYTHONPATH?"
             ) from error
     elif name not in gym.registry:

@@ -26,7 +26,7 @@ from ..envs.robot_parts import body_name
 from ..envs.robotics import check_robotics
 from .context import context_of
 from .finding import Candidate, Effector, Observed, candidates, find_effector, find_object, observe
-from .physics_access import is_simulated, physics_of
+from .physics_access import NoSimulation, is_simulated, physics_of
 from .resets import Resets, record_resets, varying_bodies
 from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of
 
@@ -119,6 +119,11 @@ def _look(env_id: str, report: Report) -> Derived:
         raise ValueError(f"{env_id!r} cannot be made: {error or type(error).__name__}") from error
     try:
         return _look_at(env_id, env, report)
+    except NoSimulation as error:
+        raise ValueError(
+            f"{env_id!r}: {error}; the object's own scene can only be made from one; train it with "
+            "--method her"
+        ) from error
     except ValueError as error:
         raise ValueError(f"{env_id!r}: {error}") from error
     finally:

@@ -14,11 +14,15 @@ _DEPTH = 4  # attributes of attributes that are looked through
 _LIKELY = ("data", "_data", "sim")  # looked at before others
 
 
+class NoSimulation(ValueError):
+    """Raised for an environment that MuJoCo does not simulate, or where that is not found."""
+
+
 def is_simulated(env: gym.Env) -> bool:
     """Whether an environment runs a MuJoCo simulation."""
     try:
         physics_of(env)
-    except ValueError:
+    except NoSimulation:
         return False
     return True
 
@@ -29,7 +33,7 @@ def physics_of(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData]:
     Asked for anew after each reset, since some environments make another model then.
 
     Raises:
-        ValueError: there is no MuJoCo simulation in it.
+        NoSimulation: there is none of MuJoCo in it.
     """
     todo: deque[tuple[Any, int]] = deque([(env.unwrapped, 0)])
     seen: set[int] = set()
@@ -47,10 +51,8 @@ def physics_of(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData]:
             continue
         seen.add(id(thing))
         todo.extend((value, depth + 1) for value in _attributes(thing))
-    raise ValueError(
-        f"{type(env.unwrapped).__name__} holds no MuJoCo simulation (mujoco.MjModel and MjData); "
-        "the object's own scene can only be made from one; train it with --method her"
-    )
+    name = type(env.unwrapped).__name__
+    raise NoSimulation(f"{name} holds no MuJoCo simulation (mujoco.MjModel and MjData)")
 
 
 def placed(

@@ -53,6 +53,10 @@ def registered(
     """
     if (env_id is None) == (make_env is None):
         raise ValueError("give an environment's id, or make_env, a function that makes it")
+    functions = {"goal": goal, "is_success": is_success, "effector": effector}
+    for word, function in {"make_env": make_env, **functions}.items():
+        if function is not None and not callable(function):
+            raise ValueError(f"{word} must be a function, not {function!r}")
     extras = (object, goal, is_success, effector)
     given: tuple[Any, ...]
     if make_env is None and all(extra is None for extra in extras):

@@ -20,7 +20,7 @@ from stable_baselines3.common.type_aliases import (
     TrainFrequencyUnit,
 )
 
-from ..common.numbers import checked_whole
+from ..common.numbers import checked_whole, shown
 from ..common.torch_helpers import matmul_at, threads_at, usual_defaults
 from ..replay.device_replay import DeviceReplay, device_replay_of, samples_otherwise
 from ..replay.her_replay_buffer import FollowObjectReplayBuffer
@@ -143,6 +143,8 @@ class HerDDPG(KeptDDPG):
             raise ValueError("hindsight replay cannot have optimize_memory_usage; leave it out")
         own_policy = policy in ("MultiInputPolicy", HerPolicy)
         own_buffer = replay_buffer_class in (None, FollowObjectReplayBuffer)
+        if not isinstance(action_noise, ActionNoise | None):
+            raise ValueError(f"action_noise must be SB3's ActionNoise, not {shown(action_noise)}")
         settings = AlgorithmSettings(
             policy=policy,
             learning_rate=learning_rate,

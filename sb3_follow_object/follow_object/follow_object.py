@@ -8,13 +8,14 @@ from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..any_task.registering import MakeEnv, made_by_function, registered
 from ..callbacks.curriculum_callback import CurriculumCallback
 from ..callbacks.reach_callback import ReachCallback
-from ..common.numbers import checked_whole
+from ..common.numbers import checked_whole, shown
 from ..common.reports import Report
 from ..ddpg.actor_files import save_actor
 from ..ddpg.her_ddpg import HerDDPG
@@ -30,9 +31,9 @@ from ..object_stage.stage import ObjectStage
 from ..settings.fields import check_names
 from ..settings.run_config import check_plain
 from .checks import check_algorithms
-from .given_settings import run_settings
+from .given_settings import check_places, run_settings
 from .robot_stage import RobotStage
-from .saved_folder import Saved, read, saved_id, write
+from .saved_folder import Saved, differing, face_of, read, saved_id, write
 
 _OF_AN_ENVIRONMENT = ("env_id", "make_env", "object", "goal", "is_success", "effector")
 
@@ -48,7 +49,7 @@ class FollowObject:
     Args:
         env_id: a task of this package, e.g. "FollowObject/PnPShelf-v0", or any goal environment on
             MuJoCo that gymnasium knows, e.g. "FetchPickAndPlace-v4".
-        method: one of `METHODS`; None, "fo".
+        method: one of `METHODS`; None, "fo", or what the settings given make of it.
         preset: "default", what was measured to be best, or "paper", the authors' settings; None,
             each setting's own default, which are the plain method's.
         make_env: in place of an id, a function that makes such an environment.
@@ -98,6 +99,18 @@ class FollowObject:
         report: Report | None = None,
         **settings: Any,
     ):
+        check_places(settings, preset)
+        for name, thing, kind in (
+            ("predictor", predictor, GoalPredictor),
+            ("object_networks", object_networks, ObjectNetworks),
+        ):
+            if thing is not None and not isinstance(thing, kind):
+                raise ValueError(
+                    f"{name} must be of the class {kind.__name__}, not {shown(thing)}; "
+                    f"get_{name} makes or loads one"
+                )
+        if report is not None and not callable(report):
+            raise ValueError(f"report must be a function of a sentence, not {shown(report)}")
         full_id = registered(
             env_id,
             make_env=make_env,
@@ -117,17 +130,34 @@ class FollowObject:
             self.report,
             needs_networks=reads_object_networks(self.settings["algorithm"]),
         )
+        self._take(predictor, object_networks, lift)
         self.robot_stage = RobotStage(self.settings)
         self._checked = False
-        if predictor is not None:
-            self.object_stage.use_predictor(predictor)
-        if object_networks is not None:
-            self.object_stage.use_networks(object_networks)
-        elif self.object_stage.needs_networks and predictor is not None:
+
+    def _take(
+        self,
+        predictor: GoalPredictor | None,
+        networks: ObjectNetworks | None,
+        lift: bool | Literal["auto"],
+    ) -> None:
+        """Take what an object stage made before, or refuse what none here would read."""
+        given = {
+            "predictor": predictor is not None and not self.imagine,
+            "object_networks": networks is not None and not self.object_stage.needs_networks,
+            "lift": lift != "auto" and not self.has_object_stage,
+        }
+        if unread := [name for name, is_unread in given.items() if is_unread]:
+            raise ValueError(f"nothing of this method reads {' and '.join(unread)}; leave it out")
+        both = self.imagine and self.object_stage.needs_networks
+        if both and (predictor is None) != (networks is None):
             raise ValueError(
                 "the auxiliary reward 'sldr' needs the object's networks beside the predictor; "
                 f"give those of the same object stage ({OBJECT_FILE}), or neither"
             )
+        if predictor is not None:
+            self.object_stage.use_predictor(predictor)
+        if networks is not None:
+            self.object_stage.use_networks(networks)
 
     @property
     def has_object_stage(self) -> bool:
@@ -226,14 +256,22 @@ class FollowObject:
             progress_bar: SB3's.
 
         Raises:
-            ValueError: total_timesteps is no whole number of at least 0.
+            ValueError: total_timesteps is no whole number of at least 0, log_interval none of at
+                least 1, or something else than a callback is given as one.
         """
         total_timesteps = checked_whole("total_timesteps", total_timesteps, 0)
+        if log_interval is not None:
+            log_interval = checked_whole("log_interval", log_interval, 1)
+        for each in callback if isinstance(callback, list) else [callback]:
+            if not (each is None or isinstance(each, BaseCallback) or callable(each)):
+                raise ValueError(
+                    f"callback must be SB3's, a function, or a list of these, not {shown(each)}"
+                )
         self.prepare()
         remaining = total_timesteps - self.env_steps
         if remaining > 0:
             self.robot_stage.learn(remaining, callback, log_interval, progress_bar)
-        elif self.object_steps >= total_timesteps > 0:
+        elif self.env_steps == self.object_steps >= total_timesteps > 0:
             self.report(
                 f"the object's stage took {self.object_steps:,} env steps of {total_timesteps:,}: "
                 "none were left for the robot"
@@ -282,7 +320,8 @@ class FollowObject:
         check_plain(self.settings, "save()")
         settings = {**self.settings, "env_id": self.full_id}
         stage, state = self.object_stage, self.state_dict(replay_buffer)
-        write(Path(folder), Saved(settings, stage.predictor, stage.networks, state))
+        face = face_of(self.env_id) if made_by_function(self.env_id) else None
+        write(Path(folder), Saved(settings, stage.predictor, stage.networks, state, face))
 
     @classmethod
     def load(
@@ -311,13 +350,16 @@ class FollowObject:
                 raise ValueError(f"{folder} is of {env_id}; load() can make it of no other one")
         elif environment:
             registered(**environment, named=env_id)
-        elif made_by_function(env_id) and env_id not in gym.registry:
+        if made_by_function(env_id) and env_id not in gym.registry:
             raise ValueError(
                 f"{folder} is of an environment that came with functions: give load() make_env= "
                 "and what else FollowObject was given of it"
             )
         try:
             saved = read(folder)
+            face = face_of(env_id) if made_by_function(env_id) else None
+            if face is not None and saved.face not in (None, face):
+                raise ValueError(f"it is of another environment: {differing(saved.face, face)}")
             run = cls(
                 preset=None,
                 **saved.settings,

@@ -11,9 +11,9 @@ from ..any_task.tasks import effector_of, effector_seen_in, steps_to_reach
 from ..common.numbers import checked_whole
 from ..envs import IDS
 from ..envs.goal_envs import known_id
-from ..settings.fields import checked, settings_of
+from ..settings.fields import check_names, checked, settings_of
 from ..settings.learning import AlgorithmSettings
-from ..settings.presets import run_config
+from ..settings.presets import MARKS, method_of, run_config
 from ..settings.run_config import RunConfig, check_plain
 from ..settings.stages import StageSettings
 
@@ -32,7 +32,7 @@ def run_settings(
 
     Args:
         full_id: the task, with the module that registers it where one does.
-        method: one of `METHODS`; None takes "fo".
+        method: one of `METHODS`; None takes "fo", or what the settings make of it.
         preset: whose settings are taken where none are given; None, the settings' own defaults.
         given: settings by their names; of those that are mappings, the names given win.
         lift: the opposite of the setting object_on_table; "auto" leaves it as it is.
@@ -41,12 +41,12 @@ def run_settings(
     Raises:
         ValueError: a name or a value is not known, out of range or in the wrong place.
     """
-    _check_places(given, method, preset)
     if lift != "auto":
         given = {**given, "object_on_table": _on_table(lift, given.get("object_on_table"))}
     env_id, before = known_id(full_id), asdict(StageSettings())
     if preset is not None:
-        before |= run_config(full_id, method=method or "fo", preset=preset, seed=seed).settings
+        of_preset = run_config(full_id, method=method, preset=preset, seed=seed)
+        before |= of_preset.settings
     settings = checked(StageSettings, _merged(before, given), _WHO)
     for name, each in settings_of(StageSettings).items():
         if each.group is not None and settings[name] is None and name != "reach":
@@ -57,6 +57,9 @@ def run_settings(
         settings["reach"] = _reach_in(settings["reach"], env_id, settings["imagine"])
     if settings["n_test_episodes"] is None:
         settings["n_test_episodes"] = settings["n_envs"]
+    found = method_of({**settings, **settings["algorithm"]}, settings["imagine"])
+    if method is not None and method != found:
+        raise ValueError(f"with these settings it is method {found!r}, not {method!r}: {MARKS}")
     settings = {"env_id": env_id, **settings, "seed": checked_whole("seed", seed, 0)}
     try:
         check_plain(settings, "save()")
@@ -65,19 +68,25 @@ def run_settings(
     return settings
 
 
-def _check_places(given: Mapping[str, Any], method: str | None, preset: str | None) -> None:
-    """Raise a ValueError for what is said elsewhere."""
-    if preset is None and method is not None:
-        raise ValueError(f"method={method!r} is a preset's to know; without one, settings say it")
+def check_places(given: Mapping[str, Any], preset: str | None) -> None:
+    """Raise a ValueError for what is not known, or said elsewhere.
+
+    Args:
+        given: settings by their names.
+        preset: as it was given.
+    """
     if preset is not None and "imagine" in given:
         raise ValueError('the method says whether goals are imagined: give method="rher" or "her"')
     for name in given.keys() - settings_of(StageSettings).keys():
+        if name == "torch_threads":
+            raise ValueError("torch_threads is of a run folder: algorithm={'update_threads': ...}")
         if name in settings_of(RunConfig):
             raise ValueError(
                 f"{name} is of a run folder, which train() makes; learn() takes env steps"
             )
         if name in settings_of(AlgorithmSettings):
             raise ValueError(f"{name} is of the robot's algorithm: algorithm={{{name!r}: ...}}")
+    check_names(given, settings_of(StageSettings), _WHO)
 
 
 def _merged(before: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

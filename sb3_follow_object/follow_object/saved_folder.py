@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
+from ..any_task.tasks import registered_horizon
 from ..common.array_trees import load_tree, save_tree
 from ..common.files import atomic_write
 from ..envs.goal_envs import known_id
@@ -16,6 +20,7 @@ from ..object_stage.networks import FILE as OBJECT_NETWORKS
 from ..object_stage.networks import ObjectNetworks
 from ..settings.run_config import CONFIG
 
+_FACE = "environment"
 _SETTINGS, _PREDICTOR, _STATE = "settings.json", "predictor", "state.safetensors"
 
 
@@ -28,12 +33,15 @@ class Saved:
         predictor: F_phi, if there is one.
         object_networks: of the object stage, if they are needed.
         state: `FollowObject.state_dict`.
+        face: of an environment that came with functions (`face_of`); None of others, and in saves
+            from before 0.2.
     """
 
     settings: dict[str, Any]
     predictor: GoalPredictor | None
     object_networks: ObjectNetworks | None
     state: dict[str, Any]
+    face: dict[str, Any] | None = None
 
 
 def write(folder: Path, saved: Saved) -> None:
@@ -44,7 +52,7 @@ def write(folder: Path, saved: Saved) -> None:
     """
     if (folder / CONFIG).exists():
         raise ValueError(f"{folder} is the folder of a run; save into another one")
-    settings = json.dumps(saved.settings, indent=2).encode()
+    settings = json.dumps({**saved.settings, _FACE: saved.face}, indent=2).encode()
     folder.mkdir(parents=True, exist_ok=True)
     if saved.predictor is not None:
         saved.predictor.save(folder / _PREDICTOR)
@@ -77,4 +85,28 @@ def read(folder: Path) -> Saved:
         predictor = GoalPredictor.load(folder / _PREDICTOR, env_id=env_id)
     if (folder / OBJECT_NETWORKS).exists():
         networks = ObjectNetworks.load(folder / OBJECT_NETWORKS, env_id=env_id)
-    return Saved(settings, predictor, networks, load_tree(folder / _STATE))
+    face = settings.pop(_FACE, None)
+    return Saved(settings, predictor, networks, load_tree(folder / _STATE), face)
+
+
+def face_of(env_id: str) -> dict[str, Any]:
+    """Return what tells an environment from another that functions made, plain values."""
+    env = gym.make(env_id)
+    try:
+        return {
+            "class": type(env.unwrapped).__qualname__,
+            "observation_space": str(env.observation_space),
+            "action_space": str(env.action_space),
+            "steps": registered_horizon(env_id),
+        }
+    finally:
+        env.close()
+
+
+def differing(saved: Mapping[str, Any], face: Mapping[str, Any]) -> str:
+    """Say in which of its facts an environment differs from the one that was saved."""
+    return ", ".join(
+        f"{name} {face[name]} instead of {saved.get(name)}"
+        for name in face
+        if face[name] != saved.get(name)
+    )

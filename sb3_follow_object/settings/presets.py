@@ -16,7 +16,7 @@ from ..any_task.tasks import (
     success_distance_of,
     surface_choices,
 )
-from ..common.numbers import as_number
+from ..common.numbers import as_number, shown
 from ..common.plain_yaml import load_yaml
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, object_id
@@ -45,7 +45,7 @@ _TOLERANCES = (
 )
 _HORIZON = 50  # steps of the episodes that presets give updates and tests for
 # What makes an entry this or that method.
-_MARKS = (
+MARKS = (
     f"fo has env_wrapper {WRAPPER}, shaped reward_type dense, cher a setting "
     "replay_buffer_kwargs.cher, the auxiliary reward gives its name, and rher has none of these "
     "but settings of reach"
@@ -64,7 +64,7 @@ def preset_file(method: str, preset: str = "default") -> Path:
     Raises:
         ValueError: there is no such method or preset, with the nearest that there is.
     """
-    if method in STOCK and preset == "default":
+    if method in list(STOCK) and preset == "default":  # a list asks what cannot be hashed too
         return FOLDER / STOCK[method]
     if method not in METHODS:
         raise ValueError(f"there is no method {method!r}{did_you_mean(method, METHODS)}")
@@ -106,9 +106,11 @@ def run_config(
     module = env_id.rpartition(":")[0] if name in IDS and name not in BUILT_IN else ""
     env_id = name if name in IDS else env_id
     if file is None:
-        method = method or "fo"
+        method = "fo" if method is None else method
         check_methods([method])
-    path = preset_file(method or "fo", preset) if file is None else Path(file)
+        path = preset_file(method, preset)
+    else:
+        path = Path(file)
     known = ZooFile(path)
     imagine = known.imagines(env_id)
     settings = _task_settings(known, env_id, imagine)
@@ -116,7 +118,11 @@ def run_config(
     if ours and _is_unknown(known, env_id):
         _fit_to_horizon(settings, env_id)
     changes: dict[str, Any] = {}
+    if not isinstance(overrides, Mapping | None):
+        raise ValueError(f"overrides must be a mapping of settings, not {shown(overrides)}")
     for name, value in (overrides or {}).items():
+        if not isinstance(name, str):
+            raise ValueError(f"overrides has no setting {shown(name)}; names are text")
         _override(changes, name, value)
         _override(settings, name, value)
     check_dotted(changes, "--set")
@@ -126,9 +132,14 @@ def run_config(
         check_auxiliary(settings["auxiliary"])
     found = method_of(settings, imagine)
     if method is not None and method != found:
+        if env_id in IDS and IDS[env_id][1]:
+            raise ValueError(
+                f"{env_id!r} is the object alone, which the first stage trains; give the robot's "
+                f"id, {env_id.replace('Object-v', '-v')!r}, or --method her"
+            )
         raise ValueError(
             f"{path} trains {env_id} with method {found!r}{' after --set' * bool(changes)}, "
-            f"not {method!r}: {_MARKS}"
+            f"not {method!r}: {MARKS}"
         )
 
     of_run, of_class, of_algorithm = (

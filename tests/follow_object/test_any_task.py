@@ -17,6 +17,7 @@ from small_models import weights
 from tiny_runs import SMALL_NET, TINY, bare_run, config, quiet
 
 from sb3_follow_object.any_task import derived as looking
+from sb3_follow_object.any_task import registering
 from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.common.cache import CACHE_VARIABLE
 from sb3_follow_object.follow_object.follow_object import FollowObject
@@ -68,6 +69,16 @@ def test_a_save_of_an_environment_that_a_function_made(
     assert (again.env_id, again.env_steps) == (run.env_id, run.env_steps)
     with pytest.raises(ValueError, match="is another environment here"):
         FollowObject.load(tmp_path / "run", make_env=lambda: made())
+    monkeypatch.delitem(gym.registry, run.env_id)
+    monkeypatch.setattr(registering, "_GIVEN", {})
+    with pytest.raises(ValueError, match="of another environment: steps 40 instead of 50"):
+        FollowObject.load(
+            tmp_path / "run",
+            make_env=lambda: TimeLimit(arm_and_wall.ArmAndWall(), 40),  # type: ignore[attr-defined]
+        )
+    monkeypatch.delitem(gym.registry, run.env_id)
+    with pytest.raises(ValueError, match="came with functions: give load\\(\\) make_env="):
+        FollowObject.load(tmp_path / "run", env_id=ARM)
 
 
 @pytest.mark.parametrize(

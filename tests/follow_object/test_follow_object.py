@@ -314,7 +314,19 @@ def test_what_is_given_of_a_mapping_leaves_the_rest_to_the_preset() -> None:
         ({"n_timesteps": 3}, "n_timesteps is of a run folder"),
         ({"solved_at": 0.5}, "solved_at is of a run folder"),
         ({"imagine": False}, "the method says whether goals are imagined"),
-        ({"method": "her", "preset": None}, "method='her' is a preset's to know"),
+        ({"method": "her", "preset": None}, "with these settings it is method 'fo', not 'her'"),
+        ({"method": "her", "reach": {}}, "it is method 'rher', not 'her'"),
+        ({"method": "shaped", "reward_type": "sparse"}, "it is method 'her', not 'shaped'"),
+        ({"method": ""}, "there is no method ''"),
+        ({"method": ["fo"]}, r"there is no method \['fo'\]"),
+        ({"torch_threads": 2}, "update_threads"),
+        ({"env_id": 5}, "5 is no environment's id"),
+        ({"env_id": "FollowObject/PushSideGapObject-v0"}, f"the object alone.*{ENV}"),
+        ({"predictor": "auto"}, "must be of the class GoalPredictor, not 'auto'"),
+        ({"object_networks": 3}, "must be of the class ObjectNetworks, not 3"),
+        ({"report": 5}, "report must be a function"),
+        ({"goal": 5}, "goal must be a function, not 5"),
+        ({"method": "her", "lift": True}, "nothing of this method reads lift"),
         ({"method": "herr"}, "did you mean 'her'"),
         ({"preset": "papers"}, "did you mean 'paper'"),
         ({"method": "rher", "preset": "paper"}, "'rher' has no preset 'paper'"),
@@ -324,7 +336,7 @@ def test_what_is_said_in_the_wrong_place_is_one_sentence(
     arguments: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(ValueError, match=sentence):
-        FollowObject(ENV, **arguments)
+        FollowObject(**{"env_id": ENV, **arguments})
 
 
 @pytest.mark.parametrize("steps", [300_000.0, -1, "many"])
@@ -335,6 +347,33 @@ def test_wrong_steps_are_refused_before_the_object_learns(
     monkeypatch.setattr(run.object_stage, "learn_predictor", lambda: pytest.fail("it learns"))
     with pytest.raises(ValueError, match="total_timesteps"):
         run.learn(steps)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"callback": "x"}, "callback must be SB3's, a function, or a list of these, not 'x'"),
+        ({"callback": [None, 3]}, "or a list of these, not 3"),
+        ({"log_interval": 0}, "log_interval is 0; it must be at least 1"),
+    ],
+)
+def test_what_learn_cannot_take_is_refused_before_the_object_learns(
+    arguments: dict[str, Any], sentence: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = bare_run(ENV, **TINY)
+    monkeypatch.setattr(run.object_stage, "learn_predictor", lambda: pytest.fail("it learns"))
+    with pytest.raises(ValueError, match=sentence):
+        run.learn(3000, **arguments)
+
+
+def test_fewer_steps_than_a_robot_has_had_are_not_the_objects_fault(
+    predictor: GoalPredictor,
+) -> None:
+    said: list[str] = []
+    run = bare_run(ENV, **TINY, predictor=predictor, report=said.append).learn(600)
+    assert run.learn(300).env_steps >= 600
+    assert not [sentence for sentence in said if "none were left" in sentence]
+    run.close()
 
 
 def test_steps_that_end_with_the_objects_stage_are_told() -> None:
@@ -368,6 +407,7 @@ def test_a_save_is_loaded_for_its_own_environment(
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
+        ({"algorithm": {"action_noise": 5}}, "action_noise must be SB3.s ActionNoise, not 5"),
         ({"algorithm": {"noise_std": -1.0}}, "noise_std"),
         ({"algorithm": {"replay_buffer_kwargs": {"moved_rato": 0.5}}}, "moved_rato"),
         ({"algorithm": {"seed": 1}}, "algorithm has no setting 'seed'"),

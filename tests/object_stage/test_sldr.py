@@ -305,7 +305,16 @@ def test_other_environments_and_other_tasks_networks_are_refused(tmp_path: Path)
 def test_run_needs_the_networks_of_its_object_stage() -> None:
     algorithm = {"auxiliary": {"name": "sldr"}}
     with pytest.raises(ValueError, match="were made for env_id"):
-        bare_run("FollowObject/PnPShelf-v0", object_networks=tiny_networks())
+        bare_run(
+            "FollowObject/PnPShelf-v0",
+            object_networks=tiny_networks(),
+            algorithm=algorithm,
+            imagine=False,
+        )
+    with pytest.raises(ValueError, match="nothing of this method reads object_networks"):
+        bare_run(TASK, object_networks=tiny_networks())
+    with pytest.raises(ValueError, match="beside the predictor; give those of the same"):
+        bare_run(TASK, object_networks=tiny_networks(), algorithm=algorithm)
     with pytest.raises(ValueError, match="give FollowObject object_networks instead"):
         bare_run(TASK, algorithm={"auxiliary": {"name": "sldr", "object_networks": "x"}})
     run = bare_run(TASK, algorithm=algorithm, imagine=False, n_envs=1)
