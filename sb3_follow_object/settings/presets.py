@@ -211,8 +211,8 @@ def _auxiliary_name(settings: Mapping[str, Any]) -> str:
     return str(auxiliary.get("name", "")) if isinstance(auxiliary, dict) else ""
 
 
-def load_config(folder: str | os.PathLike[str]) -> RunConfig:
-    """Return the configuration that a run folder was started with.
+def read_config(folder: str | os.PathLike[str]) -> RunConfig:
+    """Return the configuration that a run folder was started with; imports no task.
 
     Raises:
         ValueError: the folder holds no run, or its configuration is damaged.
@@ -220,13 +220,22 @@ def load_config(folder: str | os.PathLike[str]) -> RunConfig:
     path = Path(folder) / CONFIG
     try:
         saved = json.loads(path.read_text("utf-8"))
-        config = RunConfig(**{**saved, "settings": saved["settings"]})  # without, it is none
-        import_task(config.full_id)
-        return config
+        return RunConfig(**{**saved, "settings": saved["settings"]})  # without, it is none
     except FileNotFoundError as error:
         raise ValueError(f"{folder} holds no run: there is no {path}") from error
     except (OSError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not the configuration of a run ({error})") from error
+
+
+def load_config(folder: str | os.PathLike[str]) -> RunConfig:
+    """Return the configuration of a run folder whose task is known from here on.
+
+    Raises:
+        ValueError: as `read_config`, or the module that registers the task cannot be imported.
+    """
+    config = read_config(folder)
+    import_task(config.full_id)
+    return config
 
 
 def parse_override(text: str) -> tuple[str, Any]:

@@ -21,8 +21,10 @@ from sb3_follow_object.settings.presets import (
     load_config,
     parse_override,
     preset_file,
+    read_config,
     run_config,
 )
+from sb3_follow_object.settings.run_config import RunConfig
 from sb3_follow_object.settings.zoo_yaml import (
     CALLBACK,
     OF_RUNS,
@@ -382,6 +384,14 @@ def test_run_folder_keeps_the_configuration(tmp_path: Path) -> None:
     config = run_config(TASK, overrides={"train_freq": [1, "episode"], "n_eval_episodes": 5})
     (tmp_path / "config.json").write_text(json.dumps(asdict(config)))
     assert load_config(tmp_path) == config
+
+
+def test_a_configuration_is_read_where_its_task_is_not_installed(tmp_path: Path) -> None:
+    config = RunConfig("no_module:Task-v0", "her")
+    (tmp_path / "config.json").write_text(json.dumps(asdict(config)))
+    assert read_config(tmp_path) == config
+    with pytest.raises(ValueError, match="names a module that cannot be imported"):
+        load_config(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"env_id": "x"}', '{"env_id": "x", "settings": 1}'])
