@@ -27,7 +27,7 @@ from typing import Any
 import torch as th
 
 from sb3_follow_object.common.array_trees import load_tree, save_tree
-from sb3_follow_object.comparison.cells import file_name, task_name
+from sb3_follow_object.comparison.cells import file_name
 from sb3_follow_object.comparison.cross import CROSS_TESTS
 from sb3_follow_object.comparison.figures import draw_methods, draw_results
 from sb3_follow_object.comparison.plots import draw_curves
@@ -35,7 +35,7 @@ from sb3_follow_object.comparison.results import ordered, read_results, write_ta
 from sb3_follow_object.envs import TASKS
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.runs.evaluation import evaluate
-from sb3_follow_object.runs.run_folder import POLICY, difference, noted_command
+from sb3_follow_object.runs.run_folder import POLICY, difference, noted_command, task_label
 from sb3_follow_object.settings.methods import METHODS
 from sb3_follow_object.settings.presets import load_config
 
@@ -65,7 +65,7 @@ def read_row(run: Path) -> Row:
     row: Row = {"commit": versions["commit"], "validations": read_validations(run)}
     if (run / "config.json").exists():
         config = json.loads((run / "config.json").read_text())
-        row |= {"task": task_name(config["env_id"]), "command": noted_command(run)}
+        row |= {"task": task_label(config["env_id"]), "command": noted_command(run)}
         row |= {name: config[name] for name in ("method", "seed")}
     if (run / "result.json").exists():
         row |= json.loads((run / "result.json").read_text())

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+import os
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +19,47 @@ _FLAGS = {
 }
 
 
+def shell_line(words: Sequence[str]) -> str:
+    """Return a command as one line of a shell, in letters that every file can hold.
+
+    Words with others, such as line breaks or bytes that are no text, are written as bash's $'...'.
+    """
+    return " ".join(shlex.quote(word) if word.isprintable() else _escaped(word) for word in words)
+
+
+def _escaped(word: str) -> str:
+    plain = {byte: chr(byte) for byte in range(32, 127) if byte not in b"'\\"}
+    return "$'" + "".join(plain.get(byte, f"\\x{byte:02x}") for byte in os.fsencode(word)) + "'"
+
+
+def said_with_set(texts: Iterable[str]) -> dict[str, Any]:
+    """Return the settings that --set gives.
+
+    Raises:
+        ValueError: it is given no setting, or one twice: by itself, or within another.
+    """
+    from ..settings.presets import parse_override
+
+    said: dict[str, Any] = {}
+    for text in texts:
+        name, value = parse_override(text)
+        for other in said:
+            if name == other:
+                raise ValueError(f"--set gives {name!r} twice; give it once")
+            outer, inner = sorted((name, other), key=len)
+            if inner.startswith(f"{outer}."):
+                raise ValueError(f"--set gives {inner!r} and {outer!r}, which holds it; give one")
+        said[name] = value
+    return said
+
+
 def overrides_of(args: argparse.Namespace) -> dict[str, Any]:
     """Return the settings that --set and the flags give.
 
     Raises:
-        ValueError: a flag says one thing and --set another, or --set is given no setting.
+        ValueError: a flag says one thing and --set another, or as `said_with_set`.
     """
-    from ..settings.presets import parse_override
-
-    said = dict(parse_override(text) for text in args.set)
+    said = said_with_set(args.set)
     flags: dict[str, Any] = {}
     for flag, names in _FLAGS.items():
         given = getattr(args, flag)

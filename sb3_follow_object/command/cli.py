@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ..common.reports import Trouble, reason
 from ..settings.methods import check_methods
 from . import demo, export, picture, report
-from .arguments import check_agreed, overrides_of, policy_of
+from .arguments import check_agreed, overrides_of, policy_of, said_with_set, shell_line
 from .cli_options import PROGRAM, USER_ERROR, make_parser
 from .picture_names import CURVE, IMAGINED, TASK, VIDEO
 from .streams import leave_streams, open_streams
@@ -45,9 +45,10 @@ def _run(arguments: list[str]) -> int:
     # Read as PyTorch is imported. Its threads wait for each other less greedily: with the default
     # of 300,000 turns two of them that share a core for a moment hold each other up.
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
-    args = make_parser(_COMMANDS).parse_args(arguments)
-    args.command_line = shlex.join([PROGRAM, *arguments])
+    args = argparse.Namespace(run_command=None)  # until it is read
     try:
+        make_parser(_COMMANDS).parse_args(arguments, args)
+        args.command_line = shell_line([PROGRAM, *arguments])
         args.run_command(args)
     except (ValueError, OSError, RuntimeError, MemoryError, OverflowError) as error:
         print(f"{PROGRAM}: {_sentence(error)}", file=sys.stderr)
@@ -85,26 +86,28 @@ def _train(args: argparse.Namespace) -> None:
     from ..runs.progress import ProgressBar
     from ..runs.run_folder import CONFIG
 
-    resume = args.resume or (args.resume_or_start and (args.run / CONFIG).exists())
+    # Where it is now: an environment that is made may change the working folder.
+    folder = args.run.absolute()
+    resume = args.resume or (args.resume_or_start and (folder / CONFIG).exists())
     config = _resumed_config(args) if resume else _config(args)
     with ProgressBar(config.total_timesteps, quiet=args.quiet) as bar:
         result = train(
             config,
-            args.run,
+            folder,
             resume=resume,
             report=bar.say,
             progress=bar.update,
             command=args.command_line,
         )
     if not args.quiet:
-        row = {name: result[name] for name in ("task", "method", "seed", "k_max")}
+        row = {name: result.get(name) for name in ("task", "method", "seed", "k_max")}
         row |= {"minutes": result["wall_s"] / 60.0, **_outcome(result)}
         try:
             _print_table(row)
         except OSError as error:
-            bar.say(Trouble(f"the result is in {args.run}, but not printed: {reason(error)}"))
+            bar.say(Trouble(f"the result is in {folder}, but not printed: {reason(error)}"))
     # Last, since no graphics library is to be trusted with a result that nobody has seen.
-    _illustrate(args.run, config, bar.say)
+    _illustrate(folder, config, bar.say)
 
 
 def _illustrate(run: Path, config: RunConfig, say: Callable[[str], None]) -> None:
@@ -232,7 +235,7 @@ def _outcome(result: dict[str, Any]) -> dict[str, str]:
     steps = result["env_steps"]
     return {
         "env steps": "-" if steps is None else f"{steps:,}",
-        "success": f"{result['success_rate']:.3f} of {result['episodes']}",
+        "success": f"{result['success_rate']:.3f} of {result.get('episodes', '?')}",
     }
 
 
@@ -275,28 +278,29 @@ def _named(out: Path, ending: str) -> Path:
 def _compare(args: argparse.Namespace) -> None:
     from ..common.files import lock
     from ..comparison.cells import Settings
-    from ..comparison.compare import Comparison, share_cores, write_report
+    from ..comparison.compare import Comparison, runs_left, share_cores, write_report
     from ..comparison.executors import Executor, LocalExecutor
     from ..comparison.grid import plan
     from ..comparison.grid_display import GridDisplay
     from ..envs.batch import cores
-    from ..settings.presets import parse_override
 
     check_methods(args.methods)
-    overrides = dict(parse_override(text) for text in args.set)
+    overrides = said_with_set(args.set)
     check_agreed("steps", args.steps, overrides)
+    check_agreed("threads", args.threads, overrides)
     settings = Settings(args.steps, args.preset, overrides, args.paper_evaluation)
     grid = (args.out, args.tasks, args.methods, args.seeds, settings)
-    n_runs = len(plan(*grid))  # what is invalid is refused before a cluster is asked for
+    wanted = plan(*grid)  # what is invalid is refused before a cluster is asked for
+    left = runs_left(args.out, wanted, args.retry_failed)
     executor: Executor
     if args.ray is None:
-        jobs, threads = share_cores(cores(), n_runs, args.jobs, args.threads)
+        jobs, threads = share_cores(cores(), left, args.jobs, args.threads)
         executor = LocalExecutor(jobs, args.out / "logs")
     else:
         from ..comparison.ray_executor import RayExecutor, connect
 
         jobs, threads = share_cores(
-            connect(args.ray, args.threads or 1), n_runs, args.jobs, args.threads or 1
+            connect(args.ray, args.threads or 1), left, args.jobs, args.threads or 1
         )
         executor = RayExecutor(jobs)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -311,34 +315,51 @@ def _compare(args: argparse.Namespace) -> None:
     if not args.quiet:
         print((args.out / "table.md").read_text(encoding="utf-8"), end="")
     if failed:
-        raise RuntimeError(f"{len(failed)} of {n_runs} runs failed: {', '.join(failed)}")
+        raise RuntimeError(f"{len(failed)} of {len(wanted)} runs failed: {', '.join(failed)}")
 
 
 def _predictor(args: argparse.Namespace) -> None:
     import torch as th
 
-    from ..runs.predictor_cache import learn_predictor
+    from ..common.files import lock, remove_half_written
+    from ..runs.hub_folder import check_new
+    from ..runs.predictor_cache import OF_OBJECT_STAGE, learn_predictor
 
     args.steps = args.n_envs = args.threads = None
+    folder = args.out.absolute()
     config = _config(args)
-    if args.out.exists() and not (args.out.is_dir() and not any(args.out.iterdir())):
-        raise ValueError(f"{args.out} is not empty; give another folder")
-    th.set_num_threads(1)
-    learn_predictor(config, args.out)
+    for text in args.set:
+        if text.partition("=")[0].partition(".")[0] not in OF_OBJECT_STAGE:
+            raise ValueError(
+                f"--set {text} does nothing: F_phi is learned without the robot, from "
+                + ", ".join(OF_OBJECT_STAGE)
+            )
+    check_new(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with lock(folder, wait=False):
+        remove_half_written(folder)
+        th.set_num_threads(1)
+        learn_predictor(config, folder)
     print(args.out)
 
 
 def _inspect(args: argparse.Namespace) -> None:
+    from ..imagination.goal_predictor import GoalPredictor
     from .inspecting import draw_found, inspect
 
+    if args.out is not None:
+        _named(args.out, ".png")
+    elif args.predictor is not None:
+        raise ValueError("--predictor is for the picture; say with --out FILE.png where it goes")
+    if args.predictor is not None:
+        GoalPredictor.load(args.predictor, env_id=args.env)  # before what takes long
     facts = inspect(args.env, _warn)
     width = max(map(len, facts))
     for name, words in facts.items():
         print(f"{name:<{width}}  {words}")
     if args.out is not None:
-        out = _named(args.out, ".png")
-        draw_found(args.env, out, args.predictor)
-        print(out)
+        draw_found(args.env, args.out, args.predictor)
+        print(args.out)
 
 
 def _settings(args: argparse.Namespace) -> None:

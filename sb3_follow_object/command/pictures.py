@@ -14,7 +14,7 @@ import numpy as np
 from ..any_task.context import read_context
 from ..any_task.scene_picture import GOAL_RGBA, Drawn, draw_points
 from ..common.extras import need
-from ..common.files import atomic_write
+from ..common.files import NAME_LETTERS, atomic_write
 from ..ddpg.actor_files import load_actor
 from ..envs import IDS, TASKS
 from ..envs.graphics import find_graphics
@@ -181,7 +181,7 @@ def record(
     out = Path(out)
     env = make_drawn(env_id)
     # The writer knows the format by the ending; a name of its own keeps half a video apart.
-    temporary = out.with_name(f".{out.stem}.{os.getpid()}.mp4")
+    temporary = out.with_name(f".{out.stem[:NAME_LETTERS]}.{os.getpid()}.mp4")
     try:
         _check_can_write(temporary, out)
         actor, _ = load_actor(policy_file, env.observation_space, env.action_space)  # type: ignore[arg-type]

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 LOCK = ".lock"
+# Letters of a name that its temporary file begins with: file systems take 255 bytes in all.
+NAME_LETTERS = 40
 # What file systems without locks say to who asks for one.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
@@ -29,7 +31,7 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         OSError: the folder is missing or cannot be written; ``path`` is then as it was.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    temporary = path.with_name(f".{path.name[:NAME_LETTERS]}.{uuid.uuid4().hex}.tmp")
     try:
         with open(temporary, "xb") as file:
             yield file
@@ -56,10 +58,16 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
         file.write(data)
 
 
+def is_left_over(path: Path) -> bool:
+    """Whether a file is what a writer that was killed leaves: a lock, or a temporary file."""
+    return path.name == LOCK or (path.name.startswith(".") and path.suffix == ".tmp")
+
+
 def remove_half_written(folder: str | os.PathLike[str]) -> None:
     """Remove the temporary files of writers that were killed; there must be no other writer."""
     for left in Path(folder).glob(".*.tmp"):
-        left.unlink(missing_ok=True)
+        if not left.is_dir():  # a folder is another writer's, such as one for the hub
+            left.unlink(missing_ok=True)
 
 
 @contextmanager

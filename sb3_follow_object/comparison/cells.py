@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..envs import IDS
 from ..object_stage.sldr import reads_object_networks
 from ..runs.object_stage_files import OBJECT_STAGE
 from ..runs.run_folder import CONFIG, RESULT, claim
@@ -83,12 +82,6 @@ class Cell:
         if not needs_object_stage(self.config):
             return None
         return self.folder.parent / OBJECT / f"{file_name(self.task)}-{self.seed}"
-
-
-def task_name(env_id: str) -> str:
-    """Return the short name of one of the package's tasks, or another environment's id."""
-    task, alone = IDS.get(env_id.rpartition(":")[2], (None, False))
-    return env_id if task is None or alone else task.name
 
 
 def needs_object_stage(config: RunConfig) -> bool:

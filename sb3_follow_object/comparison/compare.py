@@ -10,10 +10,10 @@ from ..common.reports import Trouble, reason
 from ..common.signals import stop_signals_to
 from ..runs.run_folder import POLICY, trained_steps
 from .cells import OBJECT, Cell, Settings, prepare, shared_stage, stage_is_ready
-from .cross import partner, read_cross_tests
+from .cross import cross_name, needs_cross_test, partner
 from .executors import Executor, Message
 from .grid_display import GridDisplay
-from .ledger import ATTEMPTS, Ledger
+from .ledger import ATTEMPTS, Ledger, given_up, read_grid
 from .worker import CROSS, STAGE, TRAIN, Job
 
 _POLL = 1.0  # seconds
@@ -26,7 +26,7 @@ def share_cores(
 
     Args:
         n_cores: that there are, >= 1.
-        n_runs: that are wanted, >= 1; more at once than that would leave cores idle.
+        n_runs: that are left to do, >= 1; more at once than that would leave cores idle.
         jobs: at once, >= 1; None takes as many as fit.
         threads: of each run, >= 1; None shares the cores out.
 
@@ -41,6 +41,26 @@ def share_cores(
     return jobs, threads or max(1, n_cores // jobs)
 
 
+def runs_left(
+    folder: str | os.PathLike[str], cells: Sequence[Cell], retry_failed: bool = False
+) -> int:
+    """Return how many runs of a grid, or their cross tests, are left to do; 1 where none is.
+
+    Args:
+        folder: of the results.
+        cells: the runs that are wanted, from `plan`.
+        retry_failed: whether runs that were given up will be tried again.
+    """
+    kept = {} if retry_failed else (read_grid(Path(folder)) or {"cells": {}})["cells"]
+
+    def is_left(cell: Cell) -> bool:
+        if given_up(kept.get(cell.name, {}), cross=cell.finished):
+            return False
+        return not cell.finished or needs_cross_test(cell.folder, cell.config)
+
+    return max(1, sum(map(is_left, cells)))
+
+
 class Comparison:
     """Runs what is missing of a grid.
 
@@ -51,7 +71,7 @@ class Comparison:
         executor: runs the jobs.
         threads: cores of each job, >= 1.
         display: shows how they go.
-        retry_failed: give runs that failed before another two attempts.
+        retry_failed: give runs and cross tests that failed before another two attempts.
     """
 
     def __init__(
@@ -70,7 +90,7 @@ class Comparison:
         self._threads = threads
         self._display = display
         self._jobs: dict[str, Job] = {}  # under way, by their names
-        self._failures: dict[str, int] = {}  # of object stages and cross tests
+        self._stage_errors: dict[str, list[str]] = {}  # of object stages, one an attempt
         self._requests = 0  # to stop
         self._stopping = False
 
@@ -140,12 +160,9 @@ class Comparison:
         """Return what failed of a cell, by its name: its run or, after that, its cross test."""
         if not cell.finished:
             return cell.name if self._failed(cell) else None
-        cross = _cross_name(cell)
-        return cross if self._given_up(cross) else None
-
-    def _given_up(self, name: str) -> bool:
-        """Whether an object stage or a cross test has used up its attempts."""
-        return self._failures.get(name, 0) >= ATTEMPTS
+        failed = self._ledger.failed(cell.name, cross=True)
+        untested = failed and needs_cross_test(cell.folder, cell.config)
+        return cross_name(cell.name, cell.task) if untested else None
 
     def _next_job(self) -> Job | None:
         """Return what to do next in the cells' order, None while all that is left must wait."""
@@ -164,8 +181,9 @@ class Comparison:
         stage = shared_stage(cell)
         if stage is not None and not stage_is_ready(stage):
             name = f"{OBJECT}/{stage.name}"
-            if self._given_up(name):
-                error = f"its object stage failed (see {name})"
+            errors = self._stage_errors.get(name, [])
+            if len(errors) >= ATTEMPTS:
+                error = f"its object stage failed: {errors[-1]}"
                 self._ledger.note_failure(cell.name, error, final=True)
                 return None
             return Job(STAGE, name, str(stage), self._threads)
@@ -173,14 +191,16 @@ class Comparison:
         return Job(TRAIN, cell.name, str(cell.folder), self._threads, command=cell.command)
 
     def _cross_job(self, cell: Cell) -> Job | None:
+        given_up = self._ledger.failed(cell.name, cross=True)
+        if given_up or not needs_cross_test(cell.folder, cell.config):
+            return None
         other = partner(cell.task)
-        if other is None:
-            return None
-        name = _cross_name(cell)
-        kept = read_cross_tests(cell.folder).get(other)
-        if kept is not None and kept["episodes"] >= cell.config.n_final_episodes:
-            return None
-        if self._given_up(name) or not (cell.folder / POLICY).exists():
+        assert other is not None
+        name = cross_name(cell.name, cell.task)
+        if not (cell.folder / POLICY).exists():
+            error = f"its run holds no {POLICY}"
+            self._ledger.note_failure(cell.name, error, final=True, cross=True)
+            self._display.say(Trouble(f"{name} failed: {error}"))
             return None
         env_id = cell.config.env_id.replace(cell.task, other)
         return Job(CROSS, name, str(cell.folder), self._threads, other=env_id)
@@ -188,31 +208,34 @@ class Comparison:
     def _take(self, name: str, message: Message) -> None:
         """Note what a job told."""
         if "failed" in message or "stopped" in message:
-            self._jobs.pop(name)
+            job = self._jobs.pop(name)
             if not self._stopping:
-                self._note_failure(name, message.get("failed") or "it was stopped from outside")
+                self._note_failure(job, message.get("failed") or "it was stopped from outside")
             self._display.ended(name)
         elif "finished" in message:
-            self._jobs.pop(name)
-            if name in self._cells:
-                self._ledger.note_success(name)
+            job = self._jobs.pop(name)
+            if job.kind != STAGE:
+                self._ledger.note_success(_cell_of(job), cross=job.kind == CROSS)
             self._display.ended(name, finished=True)
         else:
             self._display.update(name, message)
 
-    def _note_failure(self, name: str, error: str) -> None:
-        if name in self._cells:
-            self._ledger.note_failure(name, error)
-            last = self._ledger.failed(name)
+    def _note_failure(self, job: Job, error: str) -> None:
+        if job.kind == STAGE:
+            errors = self._stage_errors.setdefault(job.name, [])
+            errors.append(error)
+            last = len(errors) >= ATTEMPTS
         else:
-            self._failures[name] = self._failures.get(name, 0) + 1
-            last = self._given_up(name)
+            cell, cross = _cell_of(job), job.kind == CROSS
+            self._ledger.note_failure(cell, error, cross=cross)
+            last = self._ledger.failed(cell, cross)
         again = "it failed twice and is given up" if last else "it is taken up once more"
-        self._display.say(Trouble(f"{name} failed: {error}; {again}"))
+        self._display.say(Trouble(f"{job.name} failed: {error}; {again}"))
 
 
-def _cross_name(cell: Cell) -> str:
-    return f"{cell.name} on {partner(cell.task)}"
+def _cell_of(job: Job) -> str:
+    """Return the name of the cell whose run or cross test a job is."""
+    return Path(job.folder).name
 
 
 def write_report(folder: Path, say: Callable[[str], None]) -> None:

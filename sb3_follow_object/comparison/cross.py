@@ -11,9 +11,9 @@ from ..common.files import atomic_write
 from ..common.reports import Report
 from ..envs.goal_envs import check_task
 from ..runs.evaluation import evaluate
-from ..runs.run_folder import CROSS_TESTS, POLICY
+from ..runs.run_folder import CROSS_TESTS, POLICY, task_label
 from ..settings.presets import load_config
-from .cells import task_name
+from ..settings.run_config import RunConfig
 
 # Section 5.3: one task with two samplers of starts and goals; HER-a is trained on the first,
 # HER-b on the second, and each is tested on both.
@@ -48,7 +48,7 @@ def cross_test(
     n_episodes = config.n_final_episodes if n_episodes is None else n_episodes
     seed = config.seed if seed is None else seed
     rate = evaluate(run / POLICY, env_id, n_episodes, seed).success_rate
-    kept, name = read_cross_tests(run), task_name(env_id)
+    kept, name = read_cross_tests(run), task_label(env_id)
     if name not in kept or kept[name]["episodes"] <= n_episodes:
         kept[name] = {"success_rate": rate, "episodes": n_episodes}
         try:
@@ -85,3 +85,26 @@ def read_cross_tests(run: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
 def partner(task: str) -> str | None:
     """Return the task that policies of this one are tested on too; None for most."""
     return dict([PAIR, PAIR[::-1]]).get(task)
+
+
+def cross_name(run: str, task: str) -> str:
+    """Return the name of a run's cross test.
+
+    Args:
+        run: name of its folder.
+        task: that it was trained on.
+    """
+    return f"{run} on {partner(task)}"
+
+
+def needs_cross_test(run: Path, config: RunConfig) -> bool:
+    """Whether a run's policy is to be tested on another task, or on more episodes than it was.
+
+    Raises:
+        ValueError: the file of its cross tests is damaged.
+    """
+    other = partner(task_label(config.env_id))
+    if other is None:
+        return False
+    kept = read_cross_tests(run).get(other)
+    return kept is None or kept["episodes"] < config.n_final_episodes

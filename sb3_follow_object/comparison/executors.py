@@ -22,8 +22,9 @@ Message = dict[str, Any]
 class Executor(Protocol):
     """Runs jobs, at most `slots` at once, and tells how they go.
 
-    A message is {"figures": ...} or {"say": ...} of a job under way, and as a job's last one
-    {"finished": True}, {"stopped": True} or {"failed": "one line"}.
+    A message is {"figures": ...}, {"say": ...} or {"trouble": ...} of a job under way, the last of
+    what went wrong, and as a job's last one {"finished": True}, {"stopped": True} or
+    {"failed": "one line"}.
     """
 
     slots: int

@@ -15,7 +15,7 @@ from ..common.extras import MissingExtra, need
 from ..envs import TASKS
 from ..runs.run_folder import EVALUATIONS
 from ..settings.methods import METHODS
-from ..settings.presets import load_config
+from ..settings.presets import read_config
 from .cross import PAIR, read_cross_tests
 from .plots import X_AXES, Curve, read_curve, save_png, spread
 from .results import (
@@ -63,7 +63,7 @@ def draw_results(
         ValueError: the folder holds no runs.
     """
     runs = read_results(results)
-    drawn = list(dict.fromkeys([*methods, *ordered(METHODS, (run.method for run in runs))]))
+    drawn = _with_variants(methods, runs)
     tasks = [*TASKS, *sorted({run.task for run in runs} - set(TASKS))]
     groups = group_runs(runs, tasks, drawn)
     own = not runs or any(run.task in TASKS for run in runs)
@@ -97,13 +97,14 @@ def draw_methods(
         MissingExtra: matplotlib is not installed.
         ValueError: the folder holds no runs, or no task has runs of two of the methods.
     """
-    runs = [run for run in read_results(results) if run.method in methods]
+    runs = [run for run in read_results(results) if _plain(run.method) in methods]
     seen = [run for run in runs if run.status in (FINISHED, UNFINISHED)]
-    ran = {task: {run.method for run in seen if run.task == task} for task in TASKS}
+    ran = {task: {_plain(run.method) for run in seen if run.task == task} for task in TASKS}
     tasks = [task for task in TASKS if len(ran[task]) > 1]
     if not tasks:
         raise ValueError(f"no task in {results} has runs of two of {', '.join(methods)}")
-    save_png(_curves(group_runs(runs, tasks, methods), methods, tasks, "env_steps"), out, dpi=110)
+    drawn = _with_variants(methods, runs)
+    save_png(_curves(group_runs(runs, tasks, drawn), drawn, tasks, "env_steps"), out, dpi=110)
 
 
 def _pnp_simple(groups: Sequence[Group], methods: Sequence[str]) -> Any:
@@ -195,7 +196,7 @@ def _success_of_budget(run: Run) -> np.ndarray:
         columns = read_curve(run.folder).columns
         steps, success = columns["env_steps"], columns["success_rate"]
     steps, success = np.append(steps, run.env_steps), np.append(success, run.success_rate)
-    budget = load_config(run.folder).total_timesteps
+    budget = read_config(run.folder).total_timesteps
     return np.interp(_SHARES * budget, steps, success, left=0.0)
 
 
@@ -209,11 +210,15 @@ def _cross_panel(axis: Any, groups: Sequence[Group]) -> None:
         labels.append(f"HER-{letter} on\n{tested}")
         group = cells.get(trained)
         values = _cross_values(group, tested) if group else np.empty(0)
+        crossed = group.runs if group and tested != trained else ()
+        n_failed = sum(run.cross_error is not None for run in crossed)
         if not len(values):
             axis.bar(place, 1.0, width=0.8, **_HATCH)
-            missing = group.missing if group and group.missing else "not tested"
+            missing = group.missing if group else ""
+            missing = missing or ("failed" if n_failed else "not tested")
             axis.text(place, 0.5, missing, ha="center", va="center", rotation=90)
             continue
+        labels[-1] += f"\n{n_failed} failed" if n_failed else ""
         low, middle, high = quartiles(values)
         error = [[middle - low], [high - middle]]
         axis.bar(place, middle, width=0.8, yerr=error, capsize=3, color=_SHADES[letter])
@@ -291,6 +296,18 @@ def _legend(figure: Any, methods: Sequence[str]) -> None:
     longest = max(len(handle.get_label()) for handle in handles)
     fit = max(1, int(figure.get_figwidth() / (0.6 + 0.08 * longest)))  # inches of an entry
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), fit))
+
+
+def _with_variants(methods: Sequence[str], runs: Sequence[Run]) -> list[str]:
+    """Return methods and all that runs have, without those that ran under variants' names alone."""
+    found = ordered(METHODS, (run.method for run in runs))
+    told_apart = {_plain(name) for name in found} - set(found)
+    return list(dict.fromkeys([*(name for name in methods if name not in told_apart), *found]))
+
+
+def _plain(method: str) -> str:
+    """Return a method's name without the settings that tell it apart."""
+    return method.partition(" (")[0]
 
 
 def _narrow(method: str) -> str:

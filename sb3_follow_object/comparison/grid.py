@@ -15,12 +15,13 @@ import gymnasium as gym
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, TASKS
 from ..envs.goal_envs import check_task
-from ..runs.run_folder import CONFIG, difference
+from ..runs.run_folder import CONFIG, difference, task_label
 from ..settings.methods import METHODS
 from ..settings.presets import load_config, run_config
 from ..settings.run_config import RunConfig
-from .cells import Cell, Settings, file_name, is_empty, task_name, unread
+from .cells import Cell, Settings, file_name, is_empty, unread
 from .ledger import check_settings
+from .variants import read_configs, run_folders
 
 # A run's share of the machine; what it learns does not hang on it but for rounding.
 _SHARES = ("torch_threads", "settings.n_threads", "checkpoint_minutes")
@@ -49,8 +50,8 @@ def plan(
         threads: of each run's simulation and of its PyTorch, where the settings do not say.
 
     Raises:
-        ValueError: an unknown name, two tasks whose runs would have one folder, or the folder holds
-            results of other settings.
+        ValueError: an unknown name, settings that contradict each other, two tasks whose runs would
+            have one folder, or the folder holds results of other settings or one run twice.
     """
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
@@ -60,13 +61,15 @@ def plan(
             raise ValueError(f"there is no method {method!r}{did_you_mean(method, METHODS)}")
     ids: dict[str, str] = {}
     for env_id in map(_env_id, tasks):  # one name is one task, with a module before its id or not
-        ids.setdefault(task_name(env_id), env_id)
+        ids.setdefault(task_label(env_id), env_id)
     _check_apart(ids, methods)
     read = {(e, m): _read_by(e, m, settings) for e in ids.values() for m in methods}
     for name in settings.overrides or {}:
         if not any(name in (its.overrides or {}) for its in read.values()):
             raise ValueError(f"--set {name} does nothing: none of {', '.join(methods)} reads it")
     check_settings(folder, settings)
+    if folder.exists():
+        read_configs(run_folders(folder))  # or no table could be written in the end
     cells = []
     for seed in dict.fromkeys(seeds):
         for task, env_id in ids.items():
@@ -124,16 +127,22 @@ def _config(env_id: str, method: str, seed: int, settings: Settings, threads: in
     overrides: dict[str, Any] = {"n_threads": threads, "torch_threads": threads, **_TO_THE_END}
     if settings.steps is not None:
         overrides["n_timesteps"] = settings.steps
-    if settings.paper_evaluation:
-        overrides |= _paper_rhythm(env_id)
+    overrides |= _paper_rhythm(env_id, settings)
     overrides |= settings.overrides or {}
     return run_config(env_id, method=method, preset=settings.preset, seed=seed, overrides=overrides)
 
 
-def _paper_rhythm(env_id: str) -> dict[str, int]:
+def _paper_rhythm(env_id: str, settings: Settings) -> dict[str, int]:
+    """Return the paper's rhythm of validations, where the settings ask for it."""
+    if not settings.paper_evaluation:
+        return {}
     horizon = gym.spec(env_id.rpartition(":")[2]).max_episode_steps
     assert horizon is not None  # check_task has seen to it
-    return {"eval_every": _EPOCH_EPISODES * horizon, "n_eval_episodes": _PAPER_EPISODES}
+    rhythm = {"eval_every": _EPOCH_EPISODES * horizon, "n_eval_episodes": _PAPER_EPISODES}
+    for name in rhythm:
+        if name in (settings.overrides or {}):
+            raise ValueError(f"--paper-evaluation decides {name}; leave it or --set {name} out")
+    return rhythm
 
 
 def _command(path: Path, config: RunConfig, settings: Settings) -> str:
@@ -144,9 +153,7 @@ def _command(path: Path, config: RunConfig, settings: Settings) -> str:
         words += ["--steps", str(settings.steps)]
     if settings.preset != "default":
         words += ["--preset", settings.preset]
-    changes: dict[str, Any] = dict(_TO_THE_END)
-    if settings.paper_evaluation:
-        changes |= _paper_rhythm(config.env_id)
+    changes: dict[str, Any] = {**_TO_THE_END, **_paper_rhythm(config.env_id, settings)}
     changes |= settings.overrides or {}
     words += ["--set", *(f"{name}={json.dumps(value)}" for name, value in changes.items())]
     return shlex.join(words)

@@ -8,8 +8,10 @@ from typing import Any
 
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from ..common.copies import NoCopies
+from ..common.reports import Trouble
 from ..runs.progress import Terminal
 
 # Seconds between two reports where there is no terminal to draw on.
@@ -75,6 +77,9 @@ class GridDisplay(NoCopies):
     def update(self, name: str, message: dict[str, Any]) -> None:
         """Show what a job told."""
         row = self._running[name]
+        if "trouble" in message:
+            self.say(Trouble(f"{name}: {message['trouble']}"))
+            return
         if "say" in message:
             row["text"] = message["say"]
             return
@@ -127,7 +132,8 @@ class GridDisplay(NoCopies):
         for column in ("run", "job", "env steps", "how it goes"):
             table.add_column(column)
         for name, row in self._running.items():
-            table.add_row(name, row["kind"], self._steps(row), row["text"])
+            words = (name, row["kind"], self._steps(row), row["text"])
+            table.add_row(*map(Text, words))  # what looks like rich's markup is none
         return table
 
     def _steps(self, row: dict[str, Any]) -> str:

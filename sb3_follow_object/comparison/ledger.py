@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,14 @@ from ..runs.run_folder import difference
 from .cells import Cell, Settings
 
 GRID = "grid.json"
-ATTEMPTS = 2  # a run that failed is taken up again once
+ATTEMPTS = 2  # a run or a cross test that failed is taken up again once
 _FORMAT = 1
 
 
 class Ledger:
     """The grid file: the settings, the cells that were ever asked for, and their failures.
+
+    A cell's entry says under "cross" how its cross test failed, where it did.
 
     Args:
         folder: of the results; is created.
@@ -42,27 +44,40 @@ class Ledger:
             entry = self.cells.setdefault(cell.name, {**row, "failures": 0, "error": None})
             if retry_failed:
                 entry |= {"failures": 0, "error": None}
+                entry.pop("cross", None)
         self._write()
 
-    def failed(self, name: str) -> bool:
-        """Whether a cell has used up its attempts."""
-        return bool(self.cells[name]["failures"] >= ATTEMPTS)
+    def failed(self, name: str, cross: bool = False) -> bool:
+        """Whether a cell, or its cross test, has used up its attempts."""
+        return given_up(self.cells[name], cross)
 
-    def note_failure(self, name: str, error: str, final: bool = False) -> None:
-        """Count a failure of a cell; a final one uses up its attempts."""
+    def note_failure(self, name: str, error: str, final: bool = False, cross: bool = False) -> None:
+        """Count a failure of a cell, or of its cross test; a final one uses up its attempts."""
         entry = self.cells[name]
+        if cross:
+            entry = entry.setdefault("cross", {"failures": 0, "error": None})
         entry["failures"] = ATTEMPTS if final else entry["failures"] + 1
         entry["error"] = error
         self._write()
 
-    def note_success(self, name: str) -> None:
-        """Forget a cell's failure: the second attempt came through."""
-        if self.cells[name]["failures"]:
-            self.cells[name] |= {"failures": 0, "error": None}
+    def note_success(self, name: str, cross: bool = False) -> None:
+        """Forget the failure of a cell, or of its cross test: the second attempt came through."""
+        entry = self.cells[name]
+        if cross and "cross" in entry:
+            del entry["cross"]
+            self._write()
+        elif not cross and entry["failures"]:
+            entry |= {"failures": 0, "error": None}
             self._write()
 
     def _write(self) -> None:
         atomic_write(self._path, json.dumps(self._content, indent=1).encode())
+
+
+def given_up(entry: Mapping[str, Any], cross: bool = False) -> bool:
+    """Whether a cell has used up its attempts by its entry in the grid file, or its cross test."""
+    counted = entry.get("cross", {}) if cross else entry
+    return bool(counted.get("failures", 0) >= ATTEMPTS)
 
 
 def read_grid(folder: Path) -> dict[str, Any] | None:
@@ -81,6 +96,8 @@ def read_grid(folder: Path) -> dict[str, Any] | None:
         for cell in content["cells"].values():
             str(cell["task"]), str(cell["method"]), int(cell["seed"]), int(cell["failures"])
             str(cell["error"])
+            if "cross" in cell:
+                int(cell["cross"]["failures"]), str(cell["cross"]["error"])
     except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not the file of a comparison's grid ({error})") from error
     return dict(content)

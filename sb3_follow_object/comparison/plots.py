@@ -16,9 +16,8 @@ import numpy as np
 from ..common.extras import need
 from ..common.files import atomic_write
 from ..runs.run_folder import EVALUATIONS
-from ..settings.presets import load_config
-from ..settings.run_config import flat
-from .results import words_apart
+from ..settings.presets import read_config
+from .variants import decisive, in_words, names_apart, read_configs
 
 X_AXES = {"env_steps": ("env steps", 1.0), "wall_s": ("wall time (minutes)", 60.0)}
 _Y = {"success_rate": "success on original goals", "k_max": "k_max"}
@@ -33,7 +32,7 @@ class Curve:
         method: its name.
         columns: arrays (n,) of env_steps, wall_s, success_rate and, where imagined goals were
             shown, k_max.
-        settings: what it was trained with, by dotted names.
+        settings: what its result hangs on besides task, method and seed, by dotted names.
     """
 
     task: str
@@ -48,7 +47,7 @@ def read_curve(folder: str | os.PathLike[str]) -> Curve:
     Raises:
         ValueError: it holds no run, or one without a validation so far.
     """
-    config = load_config(folder)
+    config = read_config(folder)
     path = Path(folder) / EVALUATIONS
     rows: list[dict[str, str]] = []
     if path.exists():
@@ -61,7 +60,7 @@ def read_curve(folder: str | os.PathLike[str]) -> Curve:
         columns = {name: np.array([float(row[name]) for row in rows]) for name in names}
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not a file of evaluations ({error})") from error
-    return Curve(config.env_id, config.method, columns, flat(config.settings))
+    return Curve(config.env_id, config.method, columns, decisive(config))
 
 
 def spread(curves: Sequence[Curve], x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
@@ -91,9 +90,9 @@ def by_settings(curves: Sequence[Curve]) -> dict[str, list[Curve]]:
         curves: of one method and task; those that differ in nothing come under "".
     """
     groups: dict[str, list[Curve]] = {}
-    words = words_apart([curve.settings for curve in curves])
-    for curve, its_words in zip(curves, words, strict=True):
-        groups.setdefault(its_words, []).append(curve)
+    names = names_apart([curve.settings for curve in curves])
+    for curve in curves:
+        groups.setdefault(in_words(curve.settings, names), []).append(curve)
     return groups
 
 
@@ -103,17 +102,17 @@ def draw_curves(folders: Sequence[str | os.PathLike[str]], out: str | os.PathLik
     Lines are medians, with quartiles around them.
 
     Args:
-        folders: of the runs, >= 1.
+        folders: of the runs, >= 1; one that is named twice is drawn once.
         out: PNG file to create or replace.
 
     Raises:
         MissingExtra: matplotlib is not installed.
-        ValueError: a folder holds nothing to plot.
+        ValueError: a folder holds nothing to plot, or two hold the same finished run.
     """
     figure_module = need("matplotlib.figure", "plots")
     ticker = need("matplotlib.ticker", "plots")
     groups: dict[tuple[str, str], list[Curve]] = {}
-    for curve in map(read_curve, folders):
+    for curve in map(read_curve, read_configs(map(Path, folders))):
         groups.setdefault((curve.task, curve.method), []).append(curve)
     tasks = sorted({task for task, _ in groups})
     shown = [

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from ..common.files import atomic_write
-from ..runs.run_folder import CONFIG, RESULT, VERSIONS, noted_command, read_result
-from ..settings.presets import load_config
+from ..runs.run_folder import CONFIG, RESULT, VERSIONS, noted_command, read_result, task_label
+from ..settings.presets import read_config
 from ..settings.run_config import flat
-from .grid import task_name
 from .plots import Curve, read_curve, spread
 from .results import FINISHED, Run, group_runs, ordered, read_results, table_rows
 
@@ -112,7 +111,7 @@ def write_run_report(
         ValueError: the folder holds no run, or one that has not been validated yet.
     """
     folder, page = Path(folder), _Page()
-    config, curve = load_config(folder), read_curve(folder)
+    config, curve = read_config(folder), read_curve(folder)
     facts: list[tuple[str, Any]] = [(_STEPS, int(curve.columns["env_steps"][-1]))]
     if (folder / RESULT).exists():
         result = read_result(folder)
@@ -136,7 +135,7 @@ def write_run_report(
         page.chart_grid(logged)
         page.unfolded()
     _add_settings(page, [(folder.name, folder)])
-    page.write(Path(out), f"{task_name(config.env_id)}, {config.method}", f"seed {config.seed}")
+    page.write(Path(out), f"{task_label(config.env_id)}, {config.method}", f"seed {config.seed}")
 
 
 def write_comparison_report(
@@ -244,7 +243,7 @@ def _logged_charts(folder: Path) -> list[dict[str, Any]]:
 
 def _add_settings(page: _Page, folders: Sequence[tuple[str, Path]]) -> None:
     """Add the settings and versions of runs, those that they share once."""
-    found = {name: flat(asdict(load_config(path))) for name, path in folders}
+    found = {name: flat(asdict(read_config(path))) for name, path in folders}
     versions = {
         name: json.loads((path / VERSIONS).read_text("utf-8"))
         for name, path in folders
@@ -255,15 +254,16 @@ def _add_settings(page: _Page, folders: Sequence[tuple[str, Path]]) -> None:
             continue
         names = list(dict.fromkeys(name for values in kept.values() for name in values))
         first = next(iter(kept.values()))
-        same = [n for n in names if all(v.get(n) == first.get(n) for v in kept.values())]
+        # A setting that is null is another than one that is not there.
+        same = [n for n in names if all(v.get(n, "") == first.get(n, "") for v in kept.values())]
         page.folded(f"{title} that all runs share" if len(kept) > 1 else title)
-        page.table((name, first[name]) for name in same)
+        page.table((name, first.get(name, "")) for name in same)
         page.unfolded()
         others = [name for name in names if name not in same]
         if others:
             page.folded(f"{title} in which they differ")
             page.table(
-                ([run, *(values.get(name) for name in others)] for run, values in kept.items()),
+                ([run, *(values.get(name, "") for name in others)] for run, values in kept.items()),
                 ["run", *others],
             )
             page.unfolded()

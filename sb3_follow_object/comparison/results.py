@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,18 +15,18 @@ import numpy as np
 from ..common.extras import MissingExtra
 from ..common.files import atomic_write
 from ..envs import TASKS
-from ..runs.run_folder import CONFIG, RESULT, read_result, trained_steps
+from ..runs.run_folder import CONFIG, RESULT, read_result, task_label, trained_steps
 from ..settings.methods import METHODS
-from ..settings.presets import load_config
-from ..settings.run_config import flat
-from .cells import task_name
-from .ledger import ATTEMPTS, read_grid
+from ..settings.run_config import RunConfig
+from .cross import cross_name, needs_cross_test
+from .ledger import given_up, read_grid
 from .statistics import (
     Estimate,
     interquartile_means,
     probabilities_of_improvement,
     quartiles,
 )
+from .variants import read_configs, run_folders, words_apart
 
 FINISHED, FAILED, UNFINISHED, NOT_RUN = "finished", "failed", "unfinished", "not run"
 
@@ -48,6 +47,7 @@ class Run:
         wall_s: seconds that the whole run took; None before its end.
         success_rate: of the final test, in [0, 1]; None before the end.
         error: why it failed; None where it did not.
+        cross_error: why its cross test was given up; None where it was not.
     """
 
     folder: Path
@@ -59,6 +59,7 @@ class Run:
     wall_s: float | None = None
     success_rate: float | None = None
     error: str | None = None
+    cross_error: str | None = None
 
 
 @dataclass(frozen=True)
@@ -105,59 +106,55 @@ class Group:
 def read_results(folder: str | os.PathLike[str]) -> list[Run]:
     """Read a folder of run folders, and the runs that its grid file names beside them.
 
-    Where runs of a task and method differ in settings, their methods are told apart by them.
+    Where runs of a task and method differ in more than their seed, their methods are told apart by
+    it, on all tasks. A run that two names lead to is one run.
 
     Raises:
-        ValueError: it holds no runs, or a file of a run is damaged.
+        ValueError: it holds no runs, two folders hold the same finished one, or a file of a run is
+            damaged.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise ValueError(f"{folder} is not a folder of results")
     cells = (read_grid(folder) or {"cells": {}})["cells"]
+    configs = read_configs(run_folders(folder))
     runs = {
-        path.name: _read_run(path, cells.get(path.name))
-        for path in sorted(folder.iterdir())
-        if (path / CONFIG).exists() and not path.name.startswith(".")
+        path.name: _read_run(path, config, cells.get(path.name, {}))
+        for path, config in configs.items()
     }
     for name, cell in cells.items():
         if name not in runs:
-            failed = cell["failures"] >= ATTEMPTS
-            status, error = (FAILED, cell["error"]) if failed else (NOT_RUN, None)
+            status, error = (FAILED, cell["error"]) if given_up(cell) else (NOT_RUN, None)
             place = (folder / name, cell["task"], cell["method"], cell["seed"])
             runs[name] = Run(*place, status=status, error=error)
     if not runs:
         raise ValueError(f"{folder} holds no runs: no folder in it has a {CONFIG}")
-    return sorted(_told_apart(runs.values()), key=lambda run: (run.task, run.method, run.seed))
+    told_apart = _told_apart(list(runs.values()), words_apart(configs), cells)
+    return sorted(told_apart, key=lambda run: (run.task, run.method, run.seed))
 
 
-def words_apart(settings: Sequence[dict[str, Any]]) -> list[str]:
-    """Return, for each of several runs' settings, those in which they differ, in words.
+def _told_apart(
+    runs: Sequence[Run], words: Mapping[Path, str], cells: Collection[str]
+) -> list[Run]:
+    """Return runs whose methods say in which settings they differ from others of theirs.
 
     Args:
-        settings: by dotted names; "" for those that lack what others have.
+        runs: all.
+        words: of those that have begun, by folder.
+        cells: names of the grid's; those that have not begun will have the others' settings.
     """
-    names = dict.fromkeys(name for each in settings for name in each)
-    names.pop("n_threads", None)  # changes no result
-    differ = [name for name in names if len({repr(each.get(name, "")) for each in settings}) > 1]
-    return [
-        ", ".join(f"{name}={json.dumps(each[name])}" for name in differ if name in each)
-        for each in settings
-    ]
+    begun = [run for run in runs if run.folder in words and run.folder.name in cells]
 
+    def told(run: Run) -> Run:
+        its_words = words.get(run.folder)
+        if its_words is None:
+            alike = [other for other in begun if other.method == run.method]
+            of_task = [other for other in alike if other.task == run.task]
+            found = {words[other.folder] for other in of_task or alike}
+            its_words = found.pop() if len(found) == 1 else ""
+        return replace(run, method=f"{run.method} ({its_words})") if its_words else run
 
-def _told_apart(runs: Iterable[Run]) -> list[Run]:
-    """Return runs whose methods say in which settings they differ from others of theirs."""
-    told = []
-    alike: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        alike.setdefault((run.task, run.method), []).append(run)
-    for (_, method), group in alike.items():
-        begun = [run for run in group if (run.folder / CONFIG).exists()]
-        words = words_apart([flat(load_config(run.folder).settings) for run in begun])
-        pairs = zip(begun, words, strict=True)
-        names = {run.folder: f"{method} ({differ})" for run, differ in pairs if differ}
-        told += [replace(run, method=names.get(run.folder, method)) for run in group]
-    return told
+    return [told(run) for run in runs]
 
 
 def group_runs(
@@ -292,7 +289,9 @@ def _aggregate_lines(groups: Sequence[Group]) -> list[str]:
     """Return what holds across tasks: a line a method, and what it is taken over."""
     tasks, runs = common_runs(groups)
     if not tasks:
-        return []
+        only_one = len({group.method for group in groups}) < 2
+        none = "No interquartile means: there is no task that all methods have finished a run of."
+        return [] if only_one else ["", none]
     scores = {method: success_rates(seeds) for method, seeds in runs.items()}
     first = next(iter(scores))
     try:
@@ -320,8 +319,11 @@ def _estimate(estimate: Estimate, n_seeds: int) -> str:
 
 
 def _failure_lines(groups: Sequence[Group]) -> list[str]:
-    failed = [run for group in groups for run in group.of(FAILED)]
-    return ["", *(f"- {run.folder.name} failed: {run.error}" for run in failed)] if failed else []
+    runs = [run for group in groups for run in group.runs]
+    errors = [(run.folder.name, run.error) for run in runs]
+    errors += [(cross_name(run.folder.name, run.task), run.cross_error) for run in runs]
+    failed = [f"- {name} failed: {error}" for name, error in errors if error is not None]
+    return ["", *failed] if failed else []
 
 
 def _median(values: Sequence[float | None]) -> float | None:
@@ -329,14 +331,15 @@ def _median(values: Sequence[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
-def _read_run(path: Path, cell: dict[str, Any] | None) -> Run:
-    config = load_config(path)
-    place = (path, task_name(config.env_id), config.method, config.seed)
+def _read_run(path: Path, config: RunConfig, cell: Mapping[str, Any]) -> Run:
+    place = (path, task_label(config.env_id), config.method, config.seed)
     if (path / RESULT).exists():
         result = read_result(path)
         figures = {name: result[name] for name in ("env_steps", "wall_s", "success_rate")}
-        return Run(*place, status=FINISHED, **figures)
+        untested = given_up(cell, cross=True) and needs_cross_test(path, config)
+        cross_error = cell["cross"]["error"] if untested else None
+        return Run(*place, status=FINISHED, **figures, cross_error=cross_error)
     steps = trained_steps(path)
-    if cell is not None and cell["failures"] >= ATTEMPTS:
+    if given_up(cell):
         return Run(*place, status=FAILED, env_steps=steps, error=cell["error"])
     return Run(*place, status=UNFINISHED, env_steps=steps)

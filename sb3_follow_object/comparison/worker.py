@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..common.reports import named_reason
+from ..common.reports import Trouble, named_reason
 
 STAGE, TRAIN, CROSS = "stage", "train", "cross"
 FAILURE, INTERRUPTED = 1, 130
@@ -58,7 +58,8 @@ def run_job(job: Job, send: Send) -> None:
 
     Args:
         job: what to do.
-        send: called with {"figures": ...} after each rollout and {"say": ...} now and then.
+        send: called with {"figures": ...} after each rollout, and with {"say": ...} or
+            {"trouble": ...} now and then.
 
     Raises:
         KeyboardInterrupt: it was stopped; a run has written its checkpoint.
@@ -71,7 +72,8 @@ def run_job(job: Job, send: Send) -> None:
 
     def say(sentence: str) -> None:
         print(sentence, file=sys.stderr, flush=True)
-        send({"say": sentence.strip()})
+        kind = "trouble" if isinstance(sentence, Trouble) else "say"
+        send({kind: sentence.strip()})
 
     if job.kind == CROSS:
         cross_test(folder, job.other)

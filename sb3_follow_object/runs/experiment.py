@@ -54,7 +54,7 @@ def train(
         RuntimeError: the training cannot go on; the last checkpoint is as it was.
         KeyboardInterrupt: after the checkpoint of an interrupted run.
     """
-    folder = Path(folder)
+    folder = Path(folder).absolute()  # an environment or a callback may change the working folder
     with ExitStack() as stack:
         if resume:
             check_same_run(folder, config)

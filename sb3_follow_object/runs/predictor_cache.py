@@ -17,9 +17,17 @@ from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.predictor_files import FACTS_FILE
 from ..object_stage.networks import FILE as OBJECT_FILE
 from ..object_stage.networks import ObjectNetworks
+from ..settings.fields import settings_of
 from ..settings.presets import run_config
 from ..settings.run_config import RunConfig
+from ..settings.stages import StageSettings
 
+# The settings that the first two stages read.
+OF_OBJECT_STAGE = tuple(
+    name
+    for name in settings_of(StageSettings)
+    if name.startswith("object_") or name.endswith("_fit") or name in ("n_paths", "n_threads")
+)
 _FILES = (FACTS_FILE, OBJECT_FILE)
 
 

@@ -8,11 +8,13 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from ..callbacks.eval_callback import OriginalGoalEvalCallback
 from ..common.copies import NoCopies
+from ..common.files import atomic_write
 from ..common.signals import stop_signals_to
 from ..follow_object.follow_object import FollowObject
 from .checkpoints import Checkpoints
@@ -131,6 +133,7 @@ class RunCallback(BaseCallback):
         self.solved_at = solved_at
         self.solved_validations = solved_validations
         self.best = -1.0
+        self._best_policy = b""  # its file, empty before the first validation
         self._n_solved = 0  # validations in a row
         self._n_validated = 0
 
@@ -156,6 +159,7 @@ class RunCallback(BaseCallback):
             if rate >= self.best:
                 self.best = rate
                 self.run.save_policy(self.folder / BEST_POLICY)
+                self._best_policy = (self.folder / BEST_POLICY).read_bytes()
             self.logger.dump(self.run.env_steps)
         self.progress(
             {
@@ -176,12 +180,22 @@ class RunCallback(BaseCallback):
             "best": self.best,
             "n_validated": self._n_validated,
             "n_solved": self._n_solved,
+            "best_policy": np.frombuffer(self._best_policy, dtype=np.uint8),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
+        """Continue from `state_dict`, the best policy's file included."""
         self.run.load_state_dict(state["run"])
         self.evaluation.load_state_dict(state["evaluation"])
         self.best = state["best"]
         self._n_validated = state["n_validated"]
         self._n_solved = int(state.get("n_solved", 0))
+        path = self.folder / BEST_POLICY
+        if "best_policy" not in state:  # a checkpoint of before: the file stays as it is
+            self._best_policy = path.read_bytes() if path.exists() else b""
+            return
+        self._best_policy = state["best_policy"].tobytes()
+        if self._best_policy:
+            atomic_write(path, self._best_policy)
+        else:
+            path.unlink(missing_ok=True)

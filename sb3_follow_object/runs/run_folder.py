@@ -11,7 +11,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from ..common.files import LOCK, atomic_write
+from ..common.files import atomic_write, is_left_over
+from ..envs import IDS
 from ..settings.run_config import CONFIG, RunConfig, flat
 from .checkpoints import checkpoint_files
 
@@ -35,8 +36,13 @@ def check_empty(folder: Path) -> None:
 
 def _is_of_a_start(path: Path) -> bool:
     """Whether a file is what a start leaves that did not come to the configuration."""
-    half_written = path.name.startswith(".") and path.suffix == ".tmp"
-    return half_written or path.name in (LOCK, VERSIONS, COMMAND)
+    return is_left_over(path) or path.name in (VERSIONS, COMMAND)
+
+
+def task_label(env_id: str) -> str:
+    """Return the short name of one of the package's tasks, or another environment's id."""
+    task, alone = IDS.get(env_id.rpartition(":")[2], (None, False))
+    return env_id if task is None or alone else task.name
 
 
 def check_same_run(folder: Path, config: RunConfig) -> None:
@@ -97,7 +103,7 @@ def take_steps(folder: Path, config: RunConfig, command: str = "") -> None:
     gone = max((int(path.stem.rpartition("-")[2]) for path in checkpoint_files(folder)), default=0)
     _check_steps(folder, config, gone)
     if command and (folder / COMMAND).exists():
-        earlier = (folder / COMMAND).read_text("utf-8")
+        earlier = _commands(folder)
         atomic_write(folder / COMMAND, f"{earlier}{command}\n".encode())
     atomic_write(folder / CONFIG, json.dumps(asdict(config), indent=2).encode())
 
@@ -107,7 +113,7 @@ def _check_steps(folder: Path, config: RunConfig, gone: int) -> None:
     if config.total_timesteps < gone:
         raise ValueError(
             f"the run in {folder} has had {gone} env steps already; its steps are counted from its "
-            "beginning, so give more than that"
+            "beginning, so give at least that many"
         )
 
 
@@ -115,7 +121,39 @@ def noted_command(folder: Path, command: str = "") -> str:
     """Return what made a run, as one line of a shell; `command` where its folder does not say."""
     if not (folder / COMMAND).exists():
         return command
-    return " && ".join((folder / COMMAND).read_text("utf-8").splitlines())
+    return " && ".join(_commands(folder).splitlines())
+
+
+def _commands(folder: Path) -> str:
+    """Return what started a run, and what gave it other steps later, a line each."""
+    path = folder / COMMAND
+    try:
+        return path.read_text("utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not what started a run ({error})") from error
+
+
+def drop_later_rows(folder: Path, env_steps: int) -> None:
+    """Drop a run's validations that came after a checkpoint, as no training may follow on it.
+
+    Args:
+        folder: of the run; it need not have been validated.
+        env_steps: of the checkpoint.
+
+    Raises:
+        ValueError: the file of validations is damaged.
+    """
+    path = folder / EVALUATIONS
+    if not path.exists():
+        return
+    lines = path.read_text("utf-8").splitlines(keepends=True)
+    head, rows = lines[:1], lines[1:]
+    try:
+        kept = [row for row in rows if int(row.split(",")[0]) <= env_steps]
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if kept != rows:
+        atomic_write(path, "".join(head + kept).encode())
 
 
 def finished_result(folder: Path, config: RunConfig) -> dict[str, Any] | None:

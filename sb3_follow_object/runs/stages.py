@@ -23,7 +23,15 @@ from .checkpoints import Checkpoints, load_newest
 from .evaluation import evaluate, evaluation_env
 from .object_stage_files import load_object_stage, save_object_stage
 from .run_callbacks import CheckpointCallback, Progress, RunCallback, Solved, StopSignals
-from .run_folder import CROSS_TESTS, EVALUATIONS, POLICY, RESULT, noted_command
+from .run_folder import (
+    CROSS_TESTS,
+    EVALUATIONS,
+    POLICY,
+    RESULT,
+    drop_later_rows,
+    noted_command,
+    task_label,
+)
 from .tensorboard_page import describe_curves
 
 
@@ -124,6 +132,7 @@ class RunStages:
         )
         if saved is not None:
             keeper.load_state_dict(saved)
+            drop_later_rows(self.folder, self.run.env_steps)
             self.checkpoints.take_memory(keeper.state_dict())
             self.run.report(f"resumed at {self.run.env_steps} env steps")
         del saved
@@ -197,7 +206,7 @@ class RunStages:
             self.run.settings["n_threads"],
         )
         result = {
-            "task": self.config.env_id.removeprefix("FollowObject/").removesuffix("-v0"),
+            "task": task_label(self.config.env_id),
             "method": self.config.method,
             "seed": self.config.seed,
             "env_steps": self.run.env_steps,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +13,7 @@ from typing import Any
 import pytest
 
 from sb3_follow_object.command import cli
-from sb3_follow_object.command.arguments import overrides_of
+from sb3_follow_object.command.arguments import overrides_of, shell_line
 from sb3_follow_object.command.cli_options import make_parser
 from sb3_follow_object.settings.presets import run_config
 from sb3_follow_object.settings.run_config import RunConfig
@@ -75,3 +77,12 @@ def test_a_resumed_runs_steps_can_be_set_either_way(tmp_path: Path) -> None:
         args = parsed("--resume", *words)
         args.run = run
         assert cli._resumed_config(args).total_timesteps == 5000
+
+
+def test_noted_commands_are_a_line_of_plain_letters_that_bash_reads_back() -> None:
+    words = ["echo", "a'b", "two\nlines\r", "\udcff\x01\\'", "ü x", "k=[1, 2]", "\u2028"]
+    line = shell_line(words)
+    assert line.isprintable() and "\n" not in line
+    line.encode()  # no bytes that are no text
+    done = subprocess.run(["bash", "-c", f"printf '%s\\0' {line}"], capture_output=True, check=True)
+    assert done.stdout.split(b"\0")[:-1] == [os.fsencode(word) for word in words]

@@ -21,11 +21,16 @@ from short_films import record_an_episode
 from sb3_follow_object.command import pictures
 from sb3_follow_object.command.cli import _print_table, main
 from sb3_follow_object.common import extras
-from sb3_follow_object.common.files import LOCK
+from sb3_follow_object.common.files import LOCK, lock
 from sb3_follow_object.common.reports import Trouble
 from sb3_follow_object.envs import physics_id
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
-from sb3_follow_object.runs.predictor_cache import CACHE_VARIABLE, get_predictor
+from sb3_follow_object.runs import predictor_cache
+from sb3_follow_object.runs.predictor_cache import (
+    CACHE_VARIABLE,
+    OF_OBJECT_STAGE,
+    get_predictor,
+)
 from sb3_follow_object.runs.progress import ProgressBar, Terminal
 from sb3_follow_object.runs.run_folder import check_empty
 
@@ -167,6 +172,18 @@ def test_resuming_changes_nothing(
     assert sentence in err
 
 
+def test_a_result_of_before_that_lacks_figures_is_shown(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
+    result = json.loads((folder / "result.json").read_text())
+    for name in ("k_max", "task", "episodes"):
+        del result[name]
+    (folder / "result.json").write_text(json.dumps(result))
+    status, out, _ = run(capsys, "train", "--run", folder, "--resume")
+    assert status == 0 and " of ?" in out
+
+
 def test_folder_of_another_run_is_not_written_over(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -287,7 +304,10 @@ def test_predictor_is_learned_once_and_then_taken_from_the_cache(
 ) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     folder = tmp_path / TASK / physics_id(TASK)
-    words = ["predictor", "--env", TASK, "--seed", 1, "--out", folder, "--set", *TINY]
+    own = [text for text in TINY if text.split("=")[0].split(".")[0] in OF_OBJECT_STAGE]
+    words = ["predictor", "--env", TASK, "--seed", 1, "--out", folder, "--set", *own]
+    folder.mkdir(parents=True)
+    (folder / LOCK).touch()  # as one leaves that was interrupted
     assert run(capsys, *words)[0] == 0
     start, goal = np.array([[1.3, 0.7, 0.425]]), np.array([[1.3, 0.9, 0.425]])
     kept = GoalPredictor.load(folder, env_id=TASK, physics=physics_id(TASK))
@@ -295,6 +315,18 @@ def test_predictor_is_learned_once_and_then_taken_from_the_cache(
     np.testing.assert_array_equal(cached.paths(start, goal), kept.paths(start, goal))
     with pytest.raises(ValueError, match="CartPole"):
         get_predictor("CartPole-v1")
+
+
+def test_predictor_sees_that_it_cannot_write_before_it_learns(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(predictor_cache, "learn_predictor", pytest.fail)
+    (tmp_path / "file").touch()
+    words = ["predictor", "--env", TASK, "--out"]
+    assert "Not a directory" in refusal(capsys, *words, tmp_path / "file" / "phi")
+    (tmp_path / "held").mkdir()
+    with lock(tmp_path / "held", wait=False):
+        assert "another process works in" in refusal(capsys, *words, tmp_path / "held")
 
 
 def test_help_does_not_wait_for_torch() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -43,6 +45,15 @@ def test_bash_completes_a_command_and_its_option(
 
     assert complete("sb3-follow-object", "exp") == ["export"]
     assert complete("sb3-follow-object", "export", "--on") == ["--onnx"]
+
+
+def test_a_reader_of_the_script_who_has_gone_is_no_traceback() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    words = [sys.executable, "-m", "sb3_follow_object", "--print-completion", "bash"]
+    done = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert done.stderr in ("", "sb3-follow-object: Broken pipe\n")
 
 
 def test_installed_command_and_module_say_the_packages_version(

@@ -86,6 +86,20 @@ def test_it_draws_imagined_goals_where_there_is_an_f_phi(
     assert "predictor" in capsys.readouterr().err
 
 
+def test_what_the_picture_lacks_is_told_before_anything_is_looked_at(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inspecting, "inspect", pytest.fail)
+    missing = str(tmp_path / "phi")
+    for words, sentence in (
+        (["--out", "arm.jpg"], "arm.jpg does not end in .png"),
+        (["--predictor", missing], "--predictor is for the picture; say with --out FILE.png"),
+        (["--out", "arm.png", "--predictor", missing], f"Cannot read {missing}/predictor.json"),
+    ):
+        assert main(["inspect", "--env", ARM, *words]) == 2
+        assert sentence in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("env_id", "sentence"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import subprocess
@@ -193,6 +194,24 @@ def test_a_run_is_filmed_and_drawn_elsewhere_without_a_write(
     assert main(["plot", str(run), "--out", str(curve)]) == 0
     assert film.exists() and curve.exists()
     assert {path: path.stat().st_mtime_ns for path in (run, *run.rglob("*"))} == before
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_a_name_may_be_as_long_as_the_disk_takes(run: Path, tmp_path: Path) -> None:
+    film, curve = (tmp_path / ("x" * 251 + ending) for ending in (".mp4", ".png"))
+    assert main(["watch", str(run), "--episodes", "1", "--out", str(film)]) == 0
+    assert main(["plot", str(run), "--out", str(curve)]) == 0
+    assert film.exists() and curve.exists()
+
+
+def test_a_run_may_have_a_name_that_is_no_text(tmp_path: Path) -> None:
+    folder = tmp_path / "odd\udcff\nname"
+    words = ("train", "--env", runs.TASK, "--method", "her", "--steps", 200, "--n-envs", 2)
+    words += ("--threads", 1, "--quiet", "--set", *TINY_NETWORKS, *TINY_TESTS[1:])
+    assert command(*words, "--run", folder, MUJOCO_GL="off")[0] == 0
+    noted = json.loads((folder / "result.json").read_text())["command"]
+    assert noted == (folder / "command.txt").read_text()[:-1]
+    assert noted.endswith(r"/odd\xff\x0aname'")
 
 
 # Libraries that are there and do not work

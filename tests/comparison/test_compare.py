@@ -18,15 +18,18 @@ from result_folders import finish
 
 from sb3_follow_object.command import cli
 from sb3_follow_object.common.files import lock
+from sb3_follow_object.common.reports import Trouble
 from sb3_follow_object.comparison import executors, figures
 from sb3_follow_object.comparison.cells import Cell, Settings, prepare
-from sb3_follow_object.comparison.compare import Comparison, share_cores
+from sb3_follow_object.comparison.compare import Comparison, runs_left, share_cores
 from sb3_follow_object.comparison.cross import CROSS_TESTS
 from sb3_follow_object.comparison.executors import LocalExecutor, Message
 from sb3_follow_object.comparison.grid import plan
 from sb3_follow_object.comparison.grid_display import GridDisplay
 from sb3_follow_object.comparison.ledger import read_grid
+from sb3_follow_object.comparison.results import read_results, write_tables
 from sb3_follow_object.comparison.worker import CROSS, STAGE, TRAIN, Job, run_job
+from sb3_follow_object.runs import experiment
 from sb3_follow_object.runs.experiment import train
 from sb3_follow_object.runs.object_stage_files import OBJECT_STAGE
 from sb3_follow_object.runs.run_folder import POLICY, RESULT
@@ -176,6 +179,9 @@ def test_failed_stage_fails_the_runs_that_need_it_and_no_others(tmp_path: Path) 
     failed = comparison(tmp_path, executor, small_plan(tmp_path))[0].run()
     assert failed == ["PnPShelf-fo-0", "PushSideGap-fo-0"]
     assert executor.names(STAGE).count("object/PnPShelf-0") == 2
+    write_tables(read_results(tmp_path), tmp_path)
+    line = "- PnPShelf-fo-0 failed: its object stage failed: ValueError: no\n"
+    assert line in (tmp_path / "table.md").read_text()
     assert sorted(executor.names(TRAIN)) == ["PnPShelf-her-0", "PushSideGap-her-0"]
 
 
@@ -228,7 +234,7 @@ def test_versions_of_pnp_simple_are_tested_on_each_other(tmp_path: Path) -> None
     assert [job.name for job in executor.jobs] == ["PnPSimpleV1-her-0 on PnPSimpleV2"]
 
 
-def test_cross_test_that_fails_twice_is_a_failure_and_is_tried_by_the_next_command(
+def test_cross_test_that_fails_twice_is_a_failure_until_it_is_asked_for_again(
     tmp_path: Path,
 ) -> None:
     failing = {"PnPSimpleV1-her-0 on PnPSimpleV2": 2, "PnPSimpleV2-her-0 on PnPSimpleV1": 1}
@@ -244,9 +250,58 @@ def test_cross_test_that_fails_twice_is_a_failure_and_is_tried_by_the_next_comma
     failed = comparison(tmp_path, executor, cells)[0].run()
     assert failed == ["PnPSimpleV1-her-0 on PnPSimpleV2"]
     assert len(executor.names(CROSS)) == 4
-    again = FakeExecutor(do)
-    assert comparison(tmp_path, again, cells)[0].run() == []
-    assert again.names(CROSS) == ["PnPSimpleV1-her-0 on PnPSimpleV2"]
+    grid = read_grid(tmp_path)
+    assert grid is not None
+    entries = {name: entry.get("cross") for name, entry in grid["cells"].items()}
+    assert entries == {
+        "PnPSimpleV1-her-0": {"failures": 2, "error": "MemoryError"},
+        "PnPSimpleV2-her-0": None,
+        "PnPShelf-her-0": None,
+    }
+
+    later = FakeExecutor(do)
+    assert comparison(tmp_path, later, cells)[0].run() == failed
+    assert later.jobs == [], "a cross test that was given up is left alone"
+    retried = comparison(tmp_path, later, cells, retry_failed=True)[0]
+    assert retried.run() == []
+    assert later.names(CROSS) == failed
+
+
+def test_cross_test_that_was_given_up_is_in_the_table_until_it_is_made(tmp_path: Path) -> None:
+    def do(job: Job) -> list[Message]:
+        return [{"failed": "MemoryError"}] if job.kind == CROSS else do_it(job)
+
+    def table() -> str:
+        write_tables(read_results(tmp_path), tmp_path)
+        return (tmp_path / "table.md").read_text()
+
+    cells = plan(tmp_path, ["PnPSimpleV1", "PnPShelf"], ["her"], [0], SETTINGS)
+    comparison(tmp_path, FakeExecutor(do), cells)[0].run()
+    line = "- PnPSimpleV1-her-0 on PnPSimpleV2 failed: MemoryError\n"
+    assert line in table()
+    by_evaluate = {"PnPSimpleV2": {"success_rate": 1.0, "episodes": 380}}
+    (cells[0].folder / CROSS_TESTS).write_text(json.dumps(by_evaluate))
+    assert line not in table()
+    assert comparison(tmp_path, FakeExecutor(do), cells)[0].run() == []
+
+
+def test_finished_run_without_a_policy_fails_its_cross_test(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def do(job: Job) -> list[Message]:
+        told = do_it(job)
+        (Path(job.folder) / POLICY).unlink(missing_ok=True)
+        return told
+
+    cells = plan(tmp_path, ["PnPSimpleV1"], ["her"], [0], SETTINGS)
+    executor = FakeExecutor(do)
+    failed = ["PnPSimpleV1-her-0 on PnPSimpleV2"]
+    assert comparison(tmp_path, executor, cells)[0].run() == failed
+    assert executor.names(CROSS) == []
+    sentence = f"{failed[0]} failed: its run holds no policy.safetensors"
+    assert sentence in capsys.readouterr().err
+    write_tables(read_results(tmp_path), tmp_path)
+    assert f"- {sentence}\n" in (tmp_path / "table.md").read_text()
 
 
 def test_command_says_which_cross_test_failed(
@@ -284,6 +339,21 @@ def test_cores_are_shared_out(
     assert share_cores(n_cores, n_runs, jobs, threads) == expected
 
 
+def test_cores_are_shared_out_among_what_is_left(tmp_path: Path) -> None:
+    def do(job: Job) -> list[Message]:
+        return [{"failed": "RuntimeError: diverged"}] if "Shelf" in job.name else do_it(job)
+
+    tasks = ["PnPShelf", "PushSideGap", "PnPSimpleV1"]
+    cells = plan(tmp_path, tasks, ["her"], [0, 1], SETTINGS)
+    assert runs_left(tmp_path, cells) == 6
+    comparison(tmp_path, FakeExecutor(do), cells[:-1])[0].run()
+    assert runs_left(tmp_path, cells) == 1, "others are finished or given up"
+    assert runs_left(tmp_path, cells, retry_failed=True) == 3
+    (cells[2].folder / CROSS_TESTS).unlink()
+    assert runs_left(tmp_path, cells) == 2
+    assert runs_left(tmp_path, cells[1:2]) == 1, "nothing is left"
+
+
 def test_no_places_are_refused() -> None:
     with pytest.raises(ValueError, match="jobs is 0; it must be at least 1"):
         share_cores(2, 1, 0, None)
@@ -318,6 +388,42 @@ def test_what_a_finished_run_is_said_to_have_is_its_success(
         display.update(name, {"say": "checkpoint at 1000 env steps: 0.2 MB"})
         display.ended(name, finished=True)
     assert told[2:] == ["a: train finished, success 0.50, k_max 25", "object/a: stage finished"]
+
+
+def test_what_looks_like_markup_is_shown_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich draws as on a terminal
+    monkeypatch.setenv("TERM", "xterm")
+    with GridDisplay() as display:
+        display.expect("run[/a]", 1000, 0)
+        display.started("run[/a]", TRAIN)
+        display.update("run[/a]", {"say": "wrote odd[/z]"})
+        display.refresh()
+    printed = capsys.readouterr().out
+    assert "run[/a]" in printed and "odd[/z]" in printed
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_trouble_of_a_job_is_said(
+    quiet: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*arguments: Any, report: Callable[[str], None], **options: Any) -> None:
+        report("checkpoint at 500 env steps")
+        report(Trouble("the checkpoint is not kept: No space left on device"))
+
+    monkeypatch.setattr(experiment, "train", full)
+    monkeypatch.setattr("sb3_follow_object.settings.presets.load_config", lambda folder: None)
+    display = GridDisplay(quiet=quiet)
+    display.started("a", TRAIN)
+    told: list[Message] = []
+    run_job(Job(TRAIN, "a", "a"), told.append)
+    capsys.readouterr()
+    for message in told:
+        display.update("a", json.loads(json.dumps(message)))
+    printed = capsys.readouterr()
+    sentence = "a: the checkpoint is not kept: No space left on device\n"
+    assert (printed.err if quiet else printed.out) == sentence
 
 
 def finished_job(executor: LocalExecutor) -> Message:

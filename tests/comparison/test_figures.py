@@ -85,6 +85,34 @@ def test_cross_test_is_drawn_with_what_is_missing(results: Path, drawn: list[Fig
     assert hatched == [False, False, True, True]
 
 
+def test_cross_test_that_failed_is_drawn_as_failed(results: Path, drawn: list[Figure]) -> None:
+    failed = {"cross": {"failures": 2, "error": "MemoryError"}}
+    write_grid(results, {"PnPSimpleV1-her-2": failed})
+    write_run(results, "PnPSimpleV1", "her", 2, 1.0)
+    draw_results(results, results / "one", methods=("her",))
+    labels = [label.get_text() for label in drawn[0].axes[0].get_xticklabels()]
+    assert labels[:2] == ["HER-a on\nPnPSimpleV1", "HER-a on\nPnPSimpleV2\n1 failed"]
+    drawn.clear()
+    write_grid(results, {f"PnPSimpleV1-her-{seed}": failed for seed in range(3)})
+    for seed in range(2):
+        (results / f"PnPSimpleV1-her-{seed}" / CROSS_TESTS).unlink()
+    draw_results(results, results / "all", methods=("her",))
+    assert [text.get_text() for text in drawn[0].axes[0].texts][:2] == ["1.00", "failed"]
+
+
+def test_method_that_ran_as_variants_alone_is_not_drawn_as_not_run(
+    results: Path, drawn: list[Figure], tmp_path: Path
+) -> None:
+    write_run(results, "PnPShelf", "rher", 0, 0.5, n_envs=2)
+    write_run(results, "PnPShelf", "rher", 1, 0.5, n_envs=4)
+    draw_results(results, results / "out", methods=("fo", "rher"))
+    labels = [label.get_text() for label in drawn[3].axes[0].get_xticklabels()]
+    assert labels == ["fo", "her", "rher\nn_envs=2", "rher\nn_envs=4"]
+    draw_methods(results, tmp_path / "few.png", ("fo", "rher"))
+    (panel,) = [axis for axis in drawn[-1].axes if axis.get_title()]
+    assert len(panel.lines) == 3
+
+
 def test_unfinished_runs_are_dotted_and_missing_methods_named(
     results: Path, drawn: list[Figure]
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,12 +20,11 @@ from sb3_follow_object.comparison.cells import (
     prepare,
     shared_stage,
     stage_settings,
-    task_name,
 )
 from sb3_follow_object.comparison.grid import plan
 from sb3_follow_object.comparison.ledger import Ledger, read_grid
 from sb3_follow_object.runs.object_stage_files import OBJECT_STAGE
-from sb3_follow_object.runs.run_folder import CONFIG, RESULT, noted_command
+from sb3_follow_object.runs.run_folder import CONFIG, RESULT, noted_command, task_label
 from sb3_follow_object.settings.methods import METHODS
 from sb3_follow_object.settings.presets import load_config
 
@@ -71,7 +71,7 @@ def test_ids_and_short_names_are_one_task_and_others_keep_their_id(tmp_path: Pat
     ],
 )
 def test_only_this_packages_ids_are_shortened(env_id: str, name: str) -> None:
-    assert task_name(env_id) == name
+    assert task_label(env_id) == name
 
 
 def register(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,6 +142,24 @@ def test_a_run_has_only_what_its_method_reads(tmp_path: Path) -> None:
         assert _config(arguments) == cell.config
     with pytest.raises(ValueError, match=r"curriculum.p does nothing: none of her, rnd reads it"):
         plan(tmp_path, ["PnPShelf"], ["her", "rnd"], [0], Settings(1000, overrides=overrides))
+
+
+@pytest.mark.parametrize("name", ["eval_every", "n_eval_episodes"])
+def test_papers_rhythm_and_another_contradict_each_other(name: str, tmp_path: Path) -> None:
+    settings = Settings(1000, overrides={name: 76}, paper_evaluation=True)
+    with pytest.raises(ValueError) as error:
+        plan(tmp_path, ["PnPShelf"], ["her"], [0], settings)
+    sentence = f"--paper-evaluation decides {name}; leave it or --set {name} out"
+    assert str(error.value) == sentence
+
+
+def test_folder_with_a_run_twice_is_refused_before_anything_is_trained(tmp_path: Path) -> None:
+    cells = plan(tmp_path, ["PnPShelf"], ["her"], [0, 1], SETTINGS)
+    prepare(cells[0], None)
+    (cells[0].folder / RESULT).write_text("{}")
+    shutil.copytree(cells[0].folder, tmp_path / "copy")
+    with pytest.raises(ValueError, match="are both seed 0 of her on PnPShelf"):
+        plan(tmp_path, ["PnPShelf"], ["her"], [1], SETTINGS)
 
 
 def test_null_is_another_setting_than_none_at_all(tmp_path: Path) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from result_folders import finish
 
 from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
+from sb3_follow_object.comparison import plots
 from sb3_follow_object.comparison.plots import by_settings, draw_curves, read_curve, spread
 from sb3_follow_object.runs.run_folder import CONFIG, EVALUATIONS
 from sb3_follow_object.settings.run_config import RunConfig
@@ -83,6 +86,21 @@ def test_runs_with_other_settings_are_lines_of_their_own(tmp_path: Path) -> None
     found = {words: len(group) for words, group in by_settings(curves).items()}
     assert found == {"": 2, "reach=null": 1, "algorithm.tau=0.05": 1}
     assert list(by_settings(curves[:2])) == [""]
+
+
+def test_run_is_drawn_once_and_a_copy_of_it_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[int] = []
+    monkeypatch.setattr(plots, "_draw_group", lambda *given: drawn.append(len(given[2])))
+    run = run_folder(tmp_path / "run", [0.1, 0.3])
+    (tmp_path / "latest").symlink_to("run")
+    draw_curves([run, run, tmp_path / "latest"], tmp_path / "curves.png")
+    assert drawn == [1]
+    finish(run)
+    copy = shutil.copytree(run, tmp_path / "copy")
+    with pytest.raises(ValueError, match="would count twice"):
+        draw_curves([run, copy], tmp_path / "curves.png")
 
 
 def test_folder_without_validations_is_refused(tmp_path: Path) -> None:

@@ -94,6 +94,17 @@ def test_comparison_has_quartiles_over_seeds_and_what_settings_differ(tmp_path: 
     assert "Settings in which they differ" in text and "Versions that all runs share" in text
 
 
+def test_setting_that_is_null_in_one_run_and_missing_in_another_is_told(tmp_path: Path) -> None:
+    make_run(tmp_path / "a")
+    path = make_run(tmp_path / "b", seed=1) / "config.json"
+    config = json.loads(path.read_text())
+    config["settings"]["reach"] = None
+    path.write_text(json.dumps(config))
+    write_comparison_report(tmp_path, tmp_path / "report.html", {})
+    _, _, differ = (tmp_path / "report.html").read_text().partition("Settings in which they differ")
+    assert "<th>settings.reach</th>" in differ
+
+
 def test_a_run_that_goes_on_has_a_line_of_its_own(tmp_path: Path) -> None:
     for seed in (0, 1, 2):
         make_run(tmp_path / f"fo-{seed}", seed=seed)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import json
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,6 +64,83 @@ def test_runs_of_other_settings_are_no_seeds_of_one_method(tmp_path: Path) -> No
         write_run(tmp_path, "PnPShelf", "fo", seed, 0.5, **settings)
     groups = group_runs(read_results(tmp_path))
     assert [(g.method, len(g.runs)) for g in groups] == [("fo", 2), ("fo (n_envs=4)", 2)]
+
+
+def write_other(folder: Path, task: str, seed: int, **changes: Any) -> None:
+    """Write a finished run whose configuration has other fields than the default's."""
+    path = write_run(folder, task, "fo", seed, 0.5) / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("total_timesteps", 1500, "n_timesteps=1500"),
+        ("solved_at", 0.9, "solved_at=0.9"),
+        ("n_final_episodes", 4, "n_final_episodes=4"),
+        ("eval_every", 700, "eval_every=700"),
+    ],
+)
+def test_runs_of_other_lengths_and_tests_are_no_seeds_of_one_method(
+    field: str, value: float, words: str, tmp_path: Path
+) -> None:
+    write_run(tmp_path, "PnPShelf", "fo", 0, 0.5)
+    write_other(tmp_path, "PnPShelf", 1, **{field: value})
+    methods = [run.method for run in read_results(tmp_path)]
+    assert f"fo ({words})" in methods and len(set(methods)) == 2
+
+
+def test_what_changes_no_result_tells_no_runs_apart(tmp_path: Path) -> None:
+    write_run(tmp_path, "PnPShelf", "fo", 0, 0.5)
+    for seed, name in enumerate(["torch_threads", "checkpoint_minutes", "keep_checkpoints"], 1):
+        write_other(tmp_path, "PnPShelf", seed, **{name: 3})
+    assert {run.method for run in read_results(tmp_path)} == {"fo"}
+
+
+def test_tasks_may_have_steps_of_their_own(tmp_path: Path) -> None:
+    write_other(tmp_path, "PnPShelf", 0, total_timesteps=1000)
+    write_other(tmp_path, "PushSideGap", 0, total_timesteps=2000)
+    assert {run.method for run in read_results(tmp_path)} == {"fo"}
+
+
+def test_choice_of_settings_has_one_name_on_all_tasks(tmp_path: Path) -> None:
+    write_run(tmp_path, "PnPShelf", "her", 0, 0.5, algorithm={"gamma": 0.98})
+    for seed, gamma in enumerate((0.98, 0.99)):
+        write_run(tmp_path, "PushSideGap", "her", seed, 0.5, algorithm={"gamma": gamma})
+    # They are the grid's, but for the one with another gamma, so what is to come is as they are.
+    names = ("PnPShelf-her-0", "PnPShelf-her-1", "PushSideGap-her-0", "PnPObstacle-her-0")
+    write_grid(tmp_path, {name: {} for name in names})
+    found = {run.folder.name: run.method for run in read_results(tmp_path)}
+    assert found.pop("PushSideGap-her-1") == "her (algorithm.gamma=0.99)"
+    assert found == dict.fromkeys(names, "her (algorithm.gamma=0.98)")
+
+
+def test_table_says_that_no_task_is_common_to_all_methods(tmp_path: Path) -> None:
+    none = "No interquartile means: there is no task that all methods have finished a run of."
+    write_run(tmp_path, "PnPShelf", "fo", 0, 0.5)
+    assert none not in markdown_table(group_runs(read_results(tmp_path)))
+    write_run(tmp_path, "PushSideGap", "her", 0, 0.5)
+    assert f"\n{none}\n" in markdown_table(group_runs(read_results(tmp_path)))
+
+
+def test_run_that_two_names_lead_to_is_counted_once(tmp_path: Path) -> None:
+    run = write_run(tmp_path, "PnPShelf", "fo", 0, 0.5)
+    (tmp_path / "latest").symlink_to(run.name)
+    write_grid(tmp_path, {run.name: {}})
+    assert [run.folder.name for run in read_results(tmp_path)] == ["PnPShelf-fo-0"]
+
+
+def test_copy_of_a_finished_run_is_refused(tmp_path: Path) -> None:
+    run = write_run(tmp_path, "PnPShelf", "fo", 0, 0.5)
+    copy = shutil.copytree(run, tmp_path / "copy")
+    with pytest.raises(ValueError) as error:
+        read_results(tmp_path)
+    assert str(error.value) == (
+        f"{run} and {copy} are both seed 0 of fo on PnPShelf with the same settings, and would "
+        "count twice; leave one of them out"
+    )
+    (copy / "result.json").unlink()
+    assert len(read_results(tmp_path)) == 2, "one of them is not finished"
 
 
 def test_markdown_table_leaves_nothing_out(results: Path) -> None:

@@ -187,7 +187,7 @@ def test_commands_train_resume_and_test_it_in_processes_of_their_own(
     run = str(tmp_path / "run")
     train, test = ["train", "--env", FULL, "--run", run], ["evaluate", run, "--episodes", "4"]
     small = ["--n-envs", "2", "--threads", "1", "--set", *TINY]
-    small += ["keep_last_checkpoint=true", "eval_every=100000"]
+    small += ["keep_last_checkpoint=true"]
     assert main([*train, "--steps", "2200", *small]) == 0
     forget()
     done = commands([*train, "--resume", "--steps", "2400"], test)

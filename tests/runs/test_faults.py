@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 import pytest
 import tiny_runs as runs
+import toy
 
 from sb3_follow_object.callbacks.rollout import run_episodes
 from sb3_follow_object.command.cli import main
@@ -28,6 +29,7 @@ from sb3_follow_object.envs import make_vec
 from sb3_follow_object.object_stage.policy import collect_paths
 from sb3_follow_object.runs.checkpoints import checkpoint_files
 from sb3_follow_object.runs.experiment import train
+from sb3_follow_object.runs.run_folder import noted_command, task_label
 from sb3_follow_object.settings.run_config import RunConfig
 
 TASK = "FollowObject/PnPSimpleV1-v0"
@@ -218,6 +220,47 @@ def test_full_disk_leaves_the_last_good_checkpoint(tmp_path: Path) -> None:
     load_tree(newest)
     assert not list((tmp_path / "run").glob(".*.tmp"))
     train(config("Good-v0"), tmp_path / "run", resume=True, report=runs.quiet)
+
+
+class Wandering(toy.PointEnv):
+    """Changes the working folder when it is made."""
+
+    def __init__(self) -> None:
+        os.chdir("/")
+        super().__init__()
+
+
+gym.register("Wandering-v0", entry_point=Wandering, max_episode_steps=toy.HORIZON)
+
+
+def test_a_relative_folder_is_the_one_of_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # and back at the end
+    result = train(
+        config("Good-v0"), "by-callback", report=runs.quiet, progress=lambda _: os.chdir("/")
+    )
+    assert result["task"] == "Good-v0"
+    os.chdir(tmp_path)
+    words = ["train", "--env", "Wandering-v0", "--method", "her", "--steps", "200"]
+    words += ["--n-envs", "2", "--threads", "1", "--quiet", "--run", "by-env", "--set"]
+    words += ["policy_kwargs.net_arch=[8]", "batch_size=16", "gradient_steps=2"]
+    words += ["buffer_size=2000", "n_final_episodes=2"]
+    assert refuse(*words) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"by-callback", "by-env"}
+    assert all((path / "result.json").exists() for path in tmp_path.iterdir())
+
+
+def test_the_packages_tasks_alone_have_short_names() -> None:
+    assert task_label("FollowObject/PnPShelf-v0") == "PnPShelf"
+    for other in ("my_module:My-Space/Point-v0", "FetchPush-v4", "FollowObject/PnPShelfObject-v0"):
+        assert task_label(other) == other
+
+
+def test_a_command_that_is_no_text_is_named(tmp_path: Path) -> None:
+    (tmp_path / "command.txt").write_bytes(b"train --run \xff\n")
+    with pytest.raises(ValueError, match=r"command.txt is not what started a run"):
+        noted_command(tmp_path)
 
 
 def refuse(*argv: object) -> int:

@@ -242,6 +242,39 @@ def test_fewer_steps_than_are_gone_are_refused_and_nothing_is_lost(crashed: Path
     assert {path: path.read_bytes() for path in crashed.iterdir() if path.is_file()} == kept
 
 
+@pytest.mark.parametrize("n_validated", [1, 2])
+@pytest.mark.parametrize("more", [0, 1])
+def test_a_run_resumed_to_end_before_its_last_validation_keeps_nothing_of_it(
+    n_validated: int, more: int, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+
+    def crash(figures: dict[str, Any]) -> None:
+        if len((folder / "evaluations.csv").read_text().splitlines()) > n_validated:
+            raise Crash
+
+    with pytest.raises(RuntimeError, match="Crash"):
+        train(runs.config(), folder, report=runs.quiet, progress=crash)
+    assert (folder / "best_policy.safetensors").exists()
+    before, newest = checkpoint_files(folder)
+    newest.unlink()  # a rollout lies between what is left and the validation
+    shorter = runs.config(total_timesteps=int(before.stem.split("-")[1]) + more)
+    runs.run(folder, config=shorter, resume=True)
+    runs.run(tmp_path / "whole", config=shorter)
+    assert runs.outcome(folder) == runs.outcome(tmp_path / "whole")
+    assert (folder / "best_policy.safetensors").exists() == (n_validated > 1)
+
+
+def test_checkpoint_without_the_best_policy_goes_on(crashed: Path, whole: dict[str, Any]) -> None:
+    """As earlier versions wrote them."""
+    for path in checkpoint_files(crashed):
+        state = load_tree(path)
+        del state["best_policy"]
+        save_tree(path, state)
+    runs.run(crashed, resume=True)
+    assert runs.outcome(crashed) == whole
+
+
 def test_finished_run_without_a_checkpoint_is_given_no_more_steps(tmp_path: Path) -> None:
     runs.run(tmp_path, config=runs.config(total_timesteps=3000))
     kept = runs.outcome(tmp_path)
