@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import time
 from pathlib import Path
@@ -196,6 +197,7 @@ class RunStages:
     def final_test(self, wall_s: float, command: str) -> dict[str, Any]:
         """Test the last policy on fresh episodes; write the run's result and return it."""
         self.run.save_policy(self.folder / POLICY)
+        gc.collect()  # callbacks hold themselves, and with them the validation's copies
         self.run.report(f"final test: {self.config.n_final_episodes} episodes")
         episodes = evaluate(
             self.folder / POLICY,

@@ -8,6 +8,7 @@ import os
 import resource
 import shutil
 import subprocess
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,9 @@ from sb3_follow_object.common.files import lock
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import make_vec
 from sb3_follow_object.object_stage.policy import collect_paths
+from sb3_follow_object.runs import evaluation, stages
 from sb3_follow_object.runs.checkpoints import checkpoint_files
+from sb3_follow_object.runs.evaluation import evaluate
 from sb3_follow_object.runs.experiment import train
 from sb3_follow_object.runs.run_folder import noted_command, task_label
 from sb3_follow_object.settings.run_config import RunConfig
@@ -231,6 +234,34 @@ class Wandering(toy.PointEnv):
 
 
 gym.register("Wandering-v0", entry_point=Wandering, max_episode_steps=toy.HORIZON)
+
+
+class Counted(toy.PointEnv):
+    """Knows how many of it there are."""
+
+    alive: weakref.WeakSet[Any] = weakref.WeakSet()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.alive.add(self)
+
+
+gym.register("Counted-v0", Counted, max_episode_steps=toy.HORIZON)
+
+
+def test_the_final_test_does_not_keep_the_validations_copies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of some robots take hundreds of megabytes each."""
+    alive = []
+
+    def counting(*arguments: Any) -> Any:
+        alive.append(len(Counted.alive))
+        return evaluate(*arguments)
+
+    monkeypatch.setattr(stages, "evaluate", counting)
+    train(config("Counted-v0"), tmp_path / "run", report=runs.quiet)
+    assert alive[0] < 2 + evaluation._COPIES, "the training's and none of the validation's"
 
 
 def test_a_relative_folder_is_the_one_of_the_start(
