@@ -267,7 +267,10 @@ def _scale_distances(settings: dict[str, Any], factor: float) -> None:
 
 
 def _fit_to_horizon(settings: dict[str, Any], env_id: str) -> None:
-    """Keep updates and tests per env step what they are in the presets' episodes."""
+    """Keep updates and tests per env step what they are in the presets' episodes.
+
+    Validations of longer episodes come after as many more env steps, or they took most of the time.
+    """
     horizon = registered_horizon(env_id)
     if horizon in (None, _HORIZON):
         return
@@ -278,6 +281,7 @@ def _fit_to_horizon(settings: dict[str, Any], env_id: str) -> None:
     for group, name, factor in (
         (settings, "gradient_steps", robot),
         (settings, "test_every", 1 / robot),
+        (settings, "eval_every", max(1, robot)),
         (reach or {}, "n_updates", robot),
         (of_object or {}, "gradient_steps", alone),
         (settings, "object_test_every", 1 / alone),

@@ -341,7 +341,9 @@ gym.register("Longer-v0", arm_and_wall.ArmAndWall, max_episode_steps=150)
 
 @pytest.mark.parametrize("method", ["fo", "her"])
 def test_longer_episodes_have_as_many_updates_and_tests_an_env_step(method: str) -> None:
-    usual, longer = (run_config(task, method=method).settings for task in (ARM, "Longer-v0"))
+    runs = [run_config(task, method=method) for task in (ARM, "Longer-v0")]
+    assert [each.eval_every for each in runs] == [20_000, 60_000]
+    usual, longer = (each.settings for each in runs)
     updates = [each["algorithm"]["gradient_steps"] for each in (usual, longer)]
     assert updates[1] == 3 * updates[0]
     if method == "fo":
