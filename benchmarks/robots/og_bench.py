@@ -8,7 +8,17 @@ from sb3_follow_object import fingertips
 from sb3_follow_object.envs import RobotTask
 
 REACHED = 0.04  # metres, as in its own success
+REPEATS = 2  # of an action: the hand moves up to 43 mm in a step, of 100 ms
 STEPS = 50  # of an episode
+
+
+class Slower(gym.Wrapper):
+    """Acts less often: a step of its own, of 50 ms, is too short to come anywhere in 50."""
+
+    def step(self, action):
+        for _ in range(REPEATS):
+            result = self.env.step(action)
+        return result
 
 
 def goal(env, observation):
@@ -22,7 +32,7 @@ def is_success(achieved, desired):
 def make(**options):
     # In its mode "task" a reset draws one of five tasks, and not from the seed.
     env = gym.make("cube-single-v0", mode="data_collection", terminate_at_goal=False, **options)
-    return RobotTask(env.unwrapped, goal, is_success, effector=fingertips)
+    return RobotTask(Slower(env.unwrapped), goal, is_success, effector=fingertips)
 
 
 gym.register("OGBench/cube-single-v0", make, max_episode_steps=STEPS)
