@@ -9,7 +9,8 @@ from sb3_follow_object.envs import RobotTask
 
 REACHED = 0.05  # metres
 HEIGHT = 0.06  # metres of the can's middle above the bin's floor
-STEPS = 150  # of an episode
+REPEATS = 3  # of an action: the hand moves up to 42 mm in a step, of 150 ms
+STEPS = 50  # of an episode
 SETTINGS = {
     "has_renderer": False,
     "has_offscreen_renderer": False,
@@ -20,7 +21,7 @@ SETTINGS = {
 
 
 class Seeded(GymWrapper):
-    """Its environment as gymnasium knows one; places are drawn from the seed."""
+    """Its environment as gymnasium knows one, slower to act; places are drawn from the seed."""
 
     unwrapped = property(lambda self: self)  # its own is none of gymnasium's environments
 
@@ -28,6 +29,11 @@ class Seeded(GymWrapper):
         if seed is not None:
             self.env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
         return super().reset()
+
+    def step(self, action):
+        for _ in range(REPEATS):
+            result = super().step(action)
+        return result
 
 
 def goal(env, observation):
