@@ -9,7 +9,7 @@ from sb3_follow_object.envs import RobotTask
 
 REACHED = 0.05  # metres
 HEIGHT = 0.06  # metres of the can's middle above the bin's floor
-REPEATS = 3  # of an action: the hand moves up to 42 mm in a step, of 150 ms
+REPEATS = 3  # of an action: the hand moves up to 61 mm in a step, of 150 ms
 STEPS = 50  # of an episode
 SETTINGS = {
     "has_renderer": False,

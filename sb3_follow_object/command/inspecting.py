@@ -24,6 +24,9 @@ from .pictures import imagined_panels, write_png
 
 _SECONDS = 1.0  # that a speed is measured for
 _COPIES = 16
+_RESETS = 10  # that the effector's way to the object is measured after
+_STEPS = 10  # of one action, in the second half of which its speed is measured
+_BUSY = 0.8  # of an episode's steps on the straight way leave too few for what lies in it
 _SHOWN = 60  # starts and goals in the picture
 _EPISODES = 3  # whose imagined goals are drawn beside them
 
@@ -49,6 +52,7 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
         "varies": _varies(found),
         "moves": "on its surface, unless it does not learn so" if found.on_surface else "freely",
         "effector": _effector(found),
+        "speed": _speed(found),
         "episodes": f"{found.horizon} steps; the object's {found.scene.task.horizon}",
         "steps a second": f"object {_object_speed(found):,.0f}, robot {_robot_speed(name):,.0f}",
         "physics": found.physics,
@@ -133,6 +137,54 @@ def _effector(found: Derived) -> str:
     first, _, last = found.effector.entries
     off = found.effector.off * 1e3
     return f"observation[{first}:{last + 1}], {off:.0f} mm off the fingertips' middle"
+
+
+def _speed(found: Derived) -> str:
+    """How quick the effector is at most, and whether an episode gives it the time."""
+    if found.effector is None:
+        return "not known"
+    entries = list(found.effector.entries)
+    env: gym.Env = robot_maker(found.env_id)()
+    try:
+        seen = [env.reset(seed=seed)[0] for seed in range(_RESETS)]
+        effectors = np.array([obs["observation"][entries] for obs in seen])
+        objects = np.array([obs["achieved_goal"] for obs in seen])
+        fastest = max(_moved(env, action, entries) for action in _extremes(env.action_space))
+    finally:
+        env.close()
+    space = goal_space(objects.shape[1:])
+    to_object = np.linalg.norm(space.point(objects) - effectors, axis=1).max()
+    to_goal = space.distance(found.resets.goals, found.resets.starts).max()
+    if fastest <= 0.0:
+        return "it does not move"
+    steps = [int(np.ceil(metres / fastest)) for metres in (to_object, to_goal)]
+    told = (
+        f"{fastest * 1e3:.0f} mm a step at most: {steps[0]} steps to the object and {steps[1]} to "
+        f"its goal where they are farthest, of {found.horizon}"
+    )
+    slow = "; too slow: make episodes longer, or do each action more than once"
+    return told + slow * (sum(steps) > _BUSY * found.horizon)
+
+
+def _extremes(actions: gym.Space) -> np.ndarray:
+    """Actions (n, d) at the ends of their range: each number at its two with the others at rest."""
+    assert isinstance(actions, gym.spaces.Box)
+    rest = (actions.low + actions.high) / 2
+    return np.stack(
+        [
+            np.where(np.arange(len(rest)) == number, end, rest)
+            for number in range(len(rest))
+            for end in (actions.low, actions.high)
+        ]
+    ).astype(actions.dtype)
+
+
+def _moved(env: gym.Env, action: np.ndarray, entries: list[int]) -> float:
+    """How far the effector comes in a step of an action, metres, once it is under way."""
+    env.reset(seed=0)
+    places = np.array([env.step(action)[0]["observation"][entries] for _ in range(_STEPS)])
+    ways = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    return float(np.median(ways[_STEPS // 2 - 1 :]))
 
 
 def _object_speed(found: Derived) -> float:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import arm_and_wall
+import gymnasium as gym
 import imageio.v3 as imageio
 import moving_wall
 import numpy as np
@@ -39,9 +42,30 @@ def test_it_says_what_is_found(capsys: pytest.CaptureFixture[str]) -> None:
     assert facts["object"] == "box (off by 0.00 mm at most; nothing else can move)"
     assert facts["reached"] == "within 50 mm"
     assert facts["effector"] == "observation[0:3], 2 mm off the fingertips' middle"
+    assert re.fullmatch(
+        r"2\d mm a step at most: \d steps to the object and 2\d to its goal where they are "
+        "farthest, of 50",
+        facts["speed"],
+    )
     assert facts["moves"].startswith("on its surface")
     assert facts["episodes"] == "50 steps; the object's 50"
     assert "where 60 episodes of ArmAndWall-v0 begin is recorded, once" in told.err
+
+
+class Slow(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
+    """Does what it is told at a third of the speed."""
+
+    def step(self, action: np.ndarray) -> Any:
+        return super().step(action / 3.0)
+
+
+gym.register("Slow-v0", Slow, max_episode_steps=50)
+
+
+def test_a_robot_without_the_time_to_get_there_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", "--env", "Slow-v0"]) == 0
+    (line,) = [each for each in capsys.readouterr().out.splitlines() if each.startswith("speed")]
+    assert line.endswith("too slow: make episodes longer, or do each action more than once")
 
 
 def test_a_goal_as_high_as_the_start_is_no_minus_above_it() -> None:
