@@ -68,7 +68,8 @@ def read_row(run: Path) -> Row:
         row |= {"task": task_label(config["env_id"]), "command": noted_command(run)}
         row |= {name: config[name] for name in ("method", "seed")}
     if (run / "result.json").exists():
-        row |= json.loads((run / "result.json").read_text())
+        result = json.loads((run / "result.json").read_text())
+        row |= {**result, "task": row.get("task", result["task"])}  # stock runs have no config.json
     elif row["validations"]:
         row |= {k: row["validations"][-1].get(k) for k in ("env_steps", "object_steps", "wall_s")}
     if "task" not in row:
