@@ -64,8 +64,9 @@ def preset_file(method: str, preset: str = "default") -> Path:
     Raises:
         ValueError: there is no such method or preset, with the nearest that there is.
     """
-    if method in list(STOCK) and preset == "default":  # a list asks what cannot be hashed too
-        return FOLDER / STOCK[method]
+    stock = STOCK.get(str(method))
+    if stock is not None and preset == "default":
+        return FOLDER / stock
     if method not in METHODS:
         raise ValueError(f"there is no method {method!r}{did_you_mean(method, METHODS)}")
     if preset not in PRESETS:
