@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import robosuite
+from robosuite import load_composite_controller_config
 from robosuite.wrappers import GymWrapper
 
 from sb3_follow_object.envs import RobotTask
@@ -47,8 +48,18 @@ def is_success(achieved, desired):
     return np.linalg.norm(achieved - desired, axis=-1) <= REACHED
 
 
+def upright():
+    """Its controller of the hand's place, without that of how the hand is turned."""
+    config = load_composite_controller_config(robot="Panda")
+    arm = config["body_parts"]["right"]
+    arm["type"] = "OSC_POSITION"
+    for name in ("input_min", "input_max", "output_min", "output_max"):
+        arm[name] = arm[name][:3] if isinstance(arm[name], list) else arm[name]
+    return config
+
+
 def make(**options):
-    env = robosuite.make("PickPlaceCan", robots="Panda", **SETTINGS)
+    env = robosuite.make("PickPlaceCan", robots="Panda", controller_configs=upright(), **SETTINGS)
     return RobotTask(Seeded(env), goal, is_success)
 
 
