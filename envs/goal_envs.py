@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -49,10 +50,30 @@ def check_task(env_id: str) -> str:
     return name
 
 
+def success_method(get: Callable[[str], Any]) -> str | None:
+    """Return the name of the method that says whether any goal is reached; None, there is none.
+
+    What has the name and is no method does not count.
+
+    Args:
+        get: returns an attribute by its name, as an environment's `get_wrapper_attr` does; raises
+            an AttributeError where there is none.
+    """
+    return next((name for name in SUCCESS_METHODS if has_method(get, name)), None)
+
+
+def has_method(get: Callable[[str], Any], name: str) -> bool:
+    """Whether there is a method of a name, `get` being as in `success_method`."""
+    try:
+        return callable(get(name))
+    except AttributeError:
+        return False
+
+
 def _judges(env: gym.Env) -> bool:
     """Whether an environment can be asked whether a goal is reached."""
-    names = (*SUCCESS_METHODS, "compute_reward")
-    return any(env.has_wrapper_attr(n) and callable(env.get_wrapper_attr(n)) for n in names)
+    get = env.get_wrapper_attr
+    return success_method(get) is not None or has_method(get, "compute_reward")
 
 
 def _hides_success(env: gym.Env) -> bool:

@@ -76,7 +76,8 @@ def import_task(env_id: str) -> str:
 
 def registration_key(spec: EnvSpec, options: Mapping[str, Any] = MappingProxyType({})) -> Any:
     """Return what tells an environment from another of its id that was registered since."""
-    return spec.id, spec.entry_point, repr(sorted({**spec.kwargs, **options}.items(), key=str))
+    said = repr(sorted({**spec.kwargs, **options}.items(), key=str))
+    return spec.id, spec.entry_point, spec.max_episode_steps, said
 
 
 def import_robotics() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..common.answers import one_each, one_number
-from .goal_envs import SUCCESS_METHODS, check_goal_keys, missing_goal_keys
+from .goal_envs import check_goal_keys, has_method, missing_goal_keys, success_method
 from .goal_space import POSITIONS
 
 Judge = Callable[..., Any]
@@ -144,7 +144,11 @@ class RobotTask(gym.Wrapper):
         """Find who says whether goals are reached, and whether of many at once."""
         judge = self._given or _success_method(self.env)
         pays = None
-        if _has(self.env, "compute_reward") and self._goal is None and self._given is None:
+        if (
+            has_method(self.env.get_wrapper_attr, "compute_reward")
+            and self._goal is None
+            and self._given is None
+        ):
             pays = rewards_on_and_off(self.env, desired)
             self.shifted = pays == (1.0, 0.0)
             if pays != (0.0, -1.0) and not self.shifted:
@@ -173,7 +177,9 @@ class RobotTask(gym.Wrapper):
 
 def needs_face(env: gym.Env) -> bool:
     """Whether an environment, which is reset and stepped, lacks what `RobotTask` adds."""
-    if missing_goal_keys(env.observation_space) or not _has(env, "compute_reward"):
+    if missing_goal_keys(env.observation_space) or not has_method(
+        env.get_wrapper_attr, "compute_reward"
+    ):
         return True
     success, reward = _success_method(env), env.get_wrapper_attr("compute_reward")
     if success is None:
@@ -198,15 +204,9 @@ def rewards_on_and_off(env: gym.Env, desired: np.ndarray) -> tuple[float, float]
 
 
 def _success_method(env: gym.Env) -> Judge | None:
-    for name in SUCCESS_METHODS:
-        if _has(env, name):
-            method: Judge = env.get_wrapper_attr(name)
-            return method
-    return None
-
-
-def _has(env: gym.Env, name: str) -> bool:
-    return env.has_wrapper_attr(name) and callable(env.get_wrapper_attr(name))
+    name = success_method(env.get_wrapper_attr)
+    method: Judge | None = None if name is None else env.get_wrapper_attr(name)
+    return method
 
 
 def _answers_batches(judge: Judge, desired: np.ndarray) -> bool:

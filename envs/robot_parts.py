@@ -78,7 +78,7 @@ def _driven(model: mujoco.MjModel) -> set[int]:
         if kind in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
             driven.add(int(model.jnt_bodyid[target]))
         elif kind == int(kinds.mjTRN_TENDON):
-            driven |= _on_tendon(model, int(target))
+            driven |= tendon_bodies(model, int(target))
         elif kind == int(kinds.mjTRN_BODY):
             driven.add(int(target))
         elif kind in (int(kinds.mjTRN_SITE), int(kinds.mjTRN_SLIDERCRANK)):
@@ -86,7 +86,8 @@ def _driven(model: mujoco.MjModel) -> set[int]:
     return driven
 
 
-def _on_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
+def tendon_bodies(model: mujoco.MjModel, tendon: int) -> set[int]:
+    """The bodies whose joints or sites a tendon runs over."""
     first = int(model.tendon_adr[tendon])
     bodies: set[int] = set()
     for wrap in range(first, first + int(model.tendon_num[tendon])):

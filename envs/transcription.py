@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from .physics_engine import mujoco
-from .robot_parts import body_name, carrier, robot_bodies, touching_geoms
+from .robot_parts import body_name, carrier, robot_bodies, tendon_bodies, touching_geoms
 
+# What makes a tendon more than a thing that is measured.
+_ACTS = ("stiffness", "damping", "frictionloss", "limited", "armature")
 JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
 _EQUALITIES = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_JOINT)
 
@@ -28,6 +30,7 @@ class Transcription:
         added: body of the model -> body of the spec; older MuJoCo finds none by its name.
         joints: joint of the model -> name in the spec.
         standing: bodies that nothing moves within an episode and that are mocap bodies here.
+        sites: site of the model -> name in the spec, of those that equalities are about.
     """
 
     spec: mujoco.MjSpec
@@ -35,6 +38,7 @@ class Transcription:
     added: dict[int, Any] = field(default_factory=dict)
     joints: dict[int, str] = field(default_factory=dict)
     standing: list[int] = field(default_factory=list)
+    sites: dict[int, str] = field(default_factory=dict)
 
 
 def transcribe(
@@ -44,8 +48,8 @@ def transcribe(
 
     Kept are the world, bodies without or with passive joints, their inertia, geoms that touch,
     pairs and excludes, equalities among them, and the options. What stands still hangs on the world
-    here, at the pose that `data` has it at. Left out are the robot, tendons, sensors and what is
-    only seen.
+    here, at the pose that `data` has it at. Left out are the robot and its tendons, sensors and
+    what is only seen.
 
     Args:
         model: any compiled model.
@@ -54,7 +58,8 @@ def transcribe(
             they become mocap bodies, so that all copies can share one model.
 
     Raises:
-        ValueError: it has deformable things, or geoms that a plugin shapes.
+        ValueError: it has deformable things, geoms that a plugin shapes, or tendons that pull at
+            nothing but passive bodies.
     """
     if model.nflex:
         raise ValueError(
@@ -68,6 +73,7 @@ def transcribe(
     _copy_options(model, spec)
     meshes: dict[tuple[str, int], str] = {}
     touching, robot = touching_geoms(model), robot_bodies(model)
+    _check_tendons(model, robot)
     for body in np.flatnonzero(~robot):
         added = _add_body(model, data, int(body), varying, copied)
         first = int(model.body_geomadr[body])
@@ -77,6 +83,26 @@ def transcribe(
     _add_contact_rules(model, copied)
     _add_equalities(model, copied)
     return copied
+
+
+def _check_tendons(model: mujoco.MjModel, robot: np.ndarray) -> None:
+    """Raise a ValueError where a tendon does something to passive bodies alone."""
+    tendons = model.eq_type == int(mujoco.mjtEq.mjEQ_TENDON)
+    tied = {*model.eq_obj1id[tendons].tolist(), *model.eq_obj2id[tendons].tolist()}
+    fields = [
+        getattr(model, f"tendon_{name}") for name in _ACTS if hasattr(model, f"tendon_{name}")
+    ]
+    for tendon in range(model.ntendon):
+        acts = tendon in tied or any(np.any(field[tendon]) for field in fields)
+        bodies = list(tendon_bodies(model, tendon))
+        passive = not robot[bodies].any() and any(carrier(model, body) for body in bodies)
+        if acts and passive:
+            named = model.tendon(tendon).name or tendon
+            raise ValueError(
+                f"tendon {named} pulls at {body_name(model, bodies[0])} and at nothing of the "
+                "robot's, which the object's own scene cannot have yet; say it by stiffness, "
+                "damping, limits and equalities of joints"
+            )
 
 
 def _copy_options(model: mujoco.MjModel, spec: mujoco.MjSpec) -> None:
@@ -207,6 +233,10 @@ def _add_geom(
         added.meshname = _mesh(model, shape, spec, meshes)
     elif kind == kinds.mjGEOM_HFIELD:
         added.hfieldname = _hfield(model, shape, spec, meshes)
+        up = np.array([0.0, 0.0, model.hfield_size[shape, 2] * _heights(model, shape).min()])
+        turned = np.zeros(3)
+        mujoco.mju_rotVecQuat(turned, up, model.geom_quat[geom])
+        added.pos[:] = model.geom_pos[geom] + turned
     else:
         added.size[:] = model.geom_size[geom]
 
@@ -234,14 +264,31 @@ def _mesh(
 def _hfield(
     model: mujoco.MjModel, field: int, spec: mujoco.MjSpec, done: dict[tuple[str, int], str]
 ) -> str:
+    """Add a height field, unless it is there.
+
+    The compiler stretches heights to [0, 1] anew: of those that an environment has written, the
+    range is put into the size, and the least raises the geom and thickens what is below.
+    """
     if ("hfield", field) not in done:
         rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
-        first = int(model.hfield_adr[field])
+        heights = _heights(model, field)
+        low, high = float(heights.min()), float(heights.max())
         added = spec.add_hfield(name=f"hfield:{field}", nrow=rows, ncol=columns)
         added.size[:] = model.hfield_size[field]
-        added.userdata = model.hfield_data[first : first + rows * columns].tolist()
+        added.size[3] += added.size[2] * low
+        if high > low:
+            added.size[2] *= high - low
+        added.userdata = heights.tolist()
         done["hfield", field] = added.name
     return done["hfield", field]
+
+
+def _heights(model: mujoco.MjModel, field: int) -> np.ndarray:
+    """Heights of a field, in parts of what its size says, (rows * columns,)."""
+    first = int(model.hfield_adr[field])
+    n = int(model.hfield_nrow[field] * model.hfield_ncol[field])
+    heights: np.ndarray = model.hfield_data[first : first + n]
+    return heights
 
 
 def _add_contact_rules(model: mujoco.MjModel, copied: Transcription) -> None:
@@ -268,17 +315,17 @@ def _add_contact_rules(model: mujoco.MjModel, copied: Transcription) -> None:
 
 
 def _add_equalities(model: mujoco.MjModel, copied: Transcription) -> None:
-    """Equalities between kept bodies or joints."""
-    kinds = mujoco.mjtEq
+    """Equalities between kept bodies, sites of theirs or joints."""
     for row in range(model.neq):
         kind = mujoco.mjtEq(int(model.eq_type[row]))
-        of_bodies = int(model.eq_objtype[row]) == int(mujoco.mjtObj.mjOBJ_BODY)
-        known = copied.joints if kind == kinds.mjEQ_JOINT else copied.bodies
-        names = [known.get(int(ids[row])) for ids in (model.eq_obj1id, model.eq_obj2id)]
-        alone = kind == kinds.mjEQ_JOINT and int(model.eq_obj2id[row]) < 0
-        if kind not in _EQUALITIES or names[0] is None or (names[1] is None and not alone):
+        if kind not in _EQUALITIES:
             continue
-        if kind != kinds.mjEQ_JOINT and not of_bodies:
+        of_joints = kind == mujoco.mjtEq.mjEQ_JOINT
+        objects = int(mujoco.mjtObj.mjOBJ_JOINT if of_joints else model.eq_objtype[row])
+        ids = [int(model.eq_obj1id[row]), int(model.eq_obj2id[row])]
+        alone = of_joints and ids[1] < 0
+        names = [_equated(model, objects, each, copied) for each in (ids[:1] if alone else ids)]
+        if None in names:
             continue
         added = copied.spec.add_equality(
             type=kind,
@@ -290,3 +337,22 @@ def _add_equalities(model: mujoco.MjModel, copied: Transcription) -> None:
             solimp=model.eq_solimp[row],
         )
         added.data[:11] = model.eq_data[row][:11]
+
+
+def _equated(model: mujoco.MjModel, kind: int, thing: int, copied: Transcription) -> str | None:
+    """The name of a joint, a body or a site that an equality is about; None, it is not kept."""
+    if kind == int(mujoco.mjtObj.mjOBJ_JOINT):
+        return copied.joints.get(thing)
+    if kind == int(mujoco.mjtObj.mjOBJ_BODY):
+        return copied.bodies.get(thing)
+    if kind != int(mujoco.mjtObj.mjOBJ_SITE):
+        return None
+    body = int(model.site_bodyid[thing])
+    if body not in copied.bodies:
+        return None
+    if thing not in copied.sites:
+        copied.sites[thing] = f"site:{thing}"
+        copied.added[body].add_site(
+            name=copied.sites[thing], pos=model.site_pos[thing], quat=model.site_quat[thing]
+        )
+    return copied.sites[thing]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,19 @@ from ..envs.robot_copies import robot_maker
 from ..envs.robot_face import RobotTask, rewards_on_and_off
 from ..envs.robot_parts import body_name
 from ..envs.robotics import check_robotics
+from .at_goal import ends_at_goal, success_distance
 from .context import context_of
-from .finding import Candidate, Effector, Observed, candidates, find_effector, find_object, observe
-from .physics_access import NoSimulation, is_simulated, physics_of
+from .finding import (
+    Candidate,
+    Effector,
+    Observed,
+    candidates,
+    check_standing,
+    find_effector,
+    find_object,
+    observe,
+)
+from .physics_access import NoSimulation, is_simulated
 from .resets import Resets, record_resets, varying_bodies
 from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of
 
@@ -34,10 +45,9 @@ N_RESETS = 2000  # episodes that are recorded; of a hundred F_phi does not learn
 _FEW = 20  # of them say what varies
 _LONG, _LONG_T = 100, 50  # episodes of more steps than this have an object whose T is that
 _FILE = "resets.safetensors"
-_FARTHEST = 0.5  # metres at which no goal is reached any more
-_HALVINGS = 16
-_ROUNDS = 3  # over an object's joints, each of which is moved as near to the goal as it can be
-_TRIED = 201  # positions of a drawer or a door, to find the one at the goal
+_COMPARED = 100  # resets that say whether what no seed says again is drawn as it was
+_ODDS = 1e-6  # of taking two sets for differently drawn that are not
+_SAME = 1e-3  # metres, and parts of a unit quaternion
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +65,8 @@ class Derived:
         context: numbers of places, of these or of what can move, that nu and F_phi see.
         shifted: whether rewards of 1 and 0 are shown as 0 and -1.
         physics: hash of what decides how the object moves and where goals lie.
+        kept_as: name of the folder in the cache; another for each distribution of what no seed
+            says again.
         resets: recorded.
         scene: of the object alone.
     """
@@ -69,6 +81,7 @@ class Derived:
     context: tuple[str, ...]
     shifted: bool
     physics: str
+    kept_as: str
     resets: Resets
     scene: DerivedScene
 
@@ -126,8 +139,18 @@ def _look(env_id: str, report: Report) -> Derived:
         ) from error
     except ValueError as error:
         raise ValueError(f"{env_id!r}: {error}") from error
+    except Exception as error:  # an environment of somebody's may raise anything
+        raise raised_by(env_id, error) from error
     finally:
         env.close()
+
+
+def raised_by(env_id: str, error: Exception) -> ValueError:
+    """The sentence about what an environment has raised while it was watched."""
+    return ValueError(
+        f"{env_id!r} raised {type(error).__name__}: {error} while it was reset and stepped and its "
+        "objects were moved"
+    )
 
 
 def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
@@ -152,19 +175,19 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
             "1 and 0"
         )
     seen = observe(env)
-    wanted = _named_object(env)
-    found = find_object(seen, wanted)
-    if ends_at_goal(env, found):
+    check_standing(seen)
+    found = find_object(seen, _named_object(env))
+    if ends_at_goal(env, found, horizon):
         raise ValueError(
             "it ends its episodes at the goal; imagined goals need episodes that go on to their "
             "time limit: turn that off in the environment"
         )
     within = success_distance(env, few.goals[:5])
-    others = [b for b in varying_bodies(model, few) if b != found.body]
     again, model_again, _ = record_resets(env, 2)
-    drawn = _drawn(env_id, few, again, others, horizon, within)
+    repeated, unrepeated = _repeated(few, again, sorted(varying_bodies(model, few)))
+    drawn = f"{env_id} {horizon} {within} {mujoco.__version__.split('.')[0]} {repeated or ''}"
     physics = physics_digest_of(model, found.body, found.offset, few, drawn, model_again)
-    resets = _kept_resets(env_id, env, physics, report)
+    kept_as, resets = _kept_resets(env_id, env, physics, unrepeated, report)
     task = DerivedTask(env_id, object_horizon(horizon), physics)
     context = context_of(model, resets, found.body)
     return Derived(
@@ -178,73 +201,10 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
         context,
         bool(isinstance(env, RobotTask) and env.shifted),
         physics,
+        kept_as,
         resets,
         object_scene_of(model, data, found.body, found.offset, resets, task, within, context),
     )
-
-
-def success_distance(env: gym.Env, goals: np.ndarray) -> float:
-    """Return how far off a goal, in whichever direction, the environment says it is reached.
-
-    Args:
-        env: with `is_success` of `RobotTask` or gymnasium-robotics.
-        goals: to try, (n, 3) metres.
-
-    Raises:
-        ValueError: it is not reached on the spot, or far away too.
-    """
-    name = "is_success" if env.has_wrapper_attr("is_success") else "_is_success"
-    judge: Callable[..., Any] = env.get_wrapper_attr(name)
-    ways = np.concatenate([np.eye(3), -np.eye(3)])
-    goal, way = np.repeat(goals, len(ways), axis=0), np.tile(ways, (len(goals), 1))
-    low, high = np.zeros(len(goal)), np.full(len(goal), _FARTHEST)
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        reached = np.asarray(judge(goal + middle[:, None] * way, goal)).astype(bool)
-        low, high = np.where(reached, middle, low), np.where(reached, high, middle)
-    nearest = round(float(high.min()), 4)
-    if not 0.0 < nearest < 0.99 * _FARTHEST:
-        raise ValueError(
-            f"is_success calls goals reached within {nearest} m; it must be more than 0 and less "
-            f"than {_FARTHEST}"
-        )
-    return nearest
-
-
-def ends_at_goal(env: gym.Env, found: Candidate) -> bool:
-    """Whether an episode is terminated once the object is put on its goal, as near as it can be."""
-    obs, _ = env.reset(seed=0)
-    model, data = physics_of(env)
-    goal = np.array(obs["desired_goal"], np.float64)
-    first = int(model.body_jntadr[found.body])
-    joints = range(first, first + int(model.body_jntnum[found.body]))
-    if int(model.jnt_type[first]) == int(mujoco.mjtJoint.mjJNT_FREE):
-        place = int(model.jnt_qposadr[first])
-        data.qpos[place : place + 3] += goal - obs["achieved_goal"]
-    else:
-        for joint in [*joints] * _ROUNDS:
-            if int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_BALL):
-                _bring(model, data, joint, found, goal)
-    mujoco.mj_forward(model, data)
-    return bool(env.step(np.zeros_like(env.action_space.sample()))[2])
-
-
-def _bring(
-    model: mujoco.MjModel, data: mujoco.MjData, joint: int, found: Candidate, goal: np.ndarray
-) -> None:
-    """Move one of an object's joints to where the object is nearest to a goal (3,)."""
-    place = int(model.jnt_qposadr[joint])
-    low, high = data.qpos[place] + np.array([-_FARTHEST, _FARTHEST])
-    if model.jnt_limited[joint]:
-        low, high = model.jnt_range[joint]
-
-    def off(position: float) -> float:
-        data.qpos[place] = position
-        mujoco.mj_kinematics(model, data)
-        frame = data.xmat[found.body].reshape(3, 3)
-        return float(np.linalg.norm(data.xpos[found.body] + frame @ found.offset - goal))
-
-    data.qpos[place] = min(np.linspace(low, high, _TRIED), key=off)
 
 
 def _horizon(env: gym.Env) -> int:
@@ -275,26 +235,72 @@ def _second(seen: Observed, found: Candidate) -> float | None:
     return next(others, None)
 
 
-def _drawn(
-    env_id: str, few: Resets, again: Resets, others: list[int], horizon: int, within: float
-) -> str:
-    """What decides how episodes are drawn: of the first ones what seeds say again."""
-    arrays = [(few.goals, again.goals), (few.starts, again.starts)]
-    arrays += [(few.places[:, body], again.places[:, body]) for body in sorted(others)]
-    episodes: list[Any] = []
-    for drawn, redrawn in arrays:
-        if np.array_equal(drawn[:2], redrawn):
-            episodes += drawn.round(5).tolist()
-    return f"{env_id} {horizon} {within} {mujoco.__version__.split('.')[0]} {episodes or ''}"
+Read = Callable[[Resets], np.ndarray]  # numbers (n, c) of n resets
 
 
-def _kept_resets(env_id: str, env: gym.Env, physics: str, report: Report) -> Resets:
-    """Return the recorded resets of a task, recorded now unless they are kept from before."""
-    folder = cache_folder() / env_id / physics
+def _repeated(few: Resets, again: Resets, others: list[int]) -> tuple[list[Any], list[Read]]:
+    """What seeds say again of how episodes are drawn, and what reads the rest out of resets."""
+    reads: list[Read] = [lambda resets: resets.goals, lambda resets: resets.starts]
+    reads += [partial(_places, body=body) for body in others]
+    repeated: list[Any] = []
+    rest: list[Read] = []
+    for read in reads:
+        if np.array_equal(read(few)[:2], read(again)):
+            repeated += read(few).round(5).tolist()
+        else:
+            rest.append(read)
+    return repeated, rest
+
+
+def _places(resets: Resets, body: int) -> np.ndarray:
+    return resets.places[:, body]
+
+
+def _kept_resets(
+    env_id: str, env: gym.Env, physics: str, unrepeated: list[Read], report: Report
+) -> tuple[str, Resets]:
+    """Return the recorded resets of a task, and the name of the folder that they are kept in.
+
+    They are recorded now unless they are kept from before. Those that begin otherwise than
+    episodes do now stay, and the task has another folder.
+    """
+    now: Resets | None = None
+    name, number = physics, 0
+    while (kept := _whole_resets(cache_folder() / env_id / name / _FILE)) is not None:
+        if unrepeated and now is None:
+            now = record_resets(env, _COMPARED)[0]
+        if now is None or all(_alike(read(now), read(kept)) for read in unrepeated):
+            return name, kept
+        report(f"episodes of {env_id} begin elsewhere now than those that are kept in {name}")
+        number += 1
+        name = f"{physics}.{number}"
+    return name, _recorded(env_id, env, cache_folder() / env_id / name, report)
+
+
+def _alike(few: np.ndarray, many: np.ndarray) -> bool:
+    """Whether two sets of numbers, (n, c) and (m, c), may have been drawn alike.
+
+    By Kolmogorov and Smirnov's test of each column, which errs once in a million times; numbers
+    that lie less than `_SAME` apart are the same to it.
+    """
+    largest = np.sqrt(np.log(2.0 / _ODDS) / 2.0 * (1.0 / len(few) + 1.0 / len(many)))
+    first, second = np.sort(few, axis=0).T, np.sort(many, axis=0).T
+    return all(
+        (_share(one, one) - _share(other, one + _SAME)).max() <= largest
+        for pair in zip(first, second, strict=True)
+        for one, other in (pair, pair[::-1])
+    )
+
+
+def _share(numbers: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Which share of sorted numbers is no more than each of some others."""
+    share: np.ndarray = np.searchsorted(numbers, at, side="right") / len(numbers)
+    return share
+
+
+def _recorded(env_id: str, env: gym.Env, folder: Path, report: Report) -> Resets:
+    """Record a task's resets into a folder, unless another process has just done so."""
     path = folder / _FILE
-    kept = _whole_resets(path)
-    if kept is not None:
-        return kept
     with ExitStack() as held:
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -8,14 +8,16 @@ import gymnasium as gym
 import numpy as np
 
 from ..envs.physics_engine import mujoco
-from ..envs.robot_parts import body_name, carrier, robot_bodies
+from ..envs.robot_parts import body_name, carrier, robot_bodies, standing, touching_geoms
 from .effectors import Fingertips
 from .physics_access import physics_of, placed
 
-N_RESETS, N_STEPS = 20, 30  # watched, the steps after one reset at random
+N_RESETS, N_STEPS = 20, 30  # that are watched: the steps, at random, are of the last episode
 TOLERANCE = 1e-3  # metres that a body's fixed point may lie off the achieved goal
 _SAME_PLACE = 1e-5  # metres between an effector and what the observation says of it
 _NUDGE = np.array([0.02, -0.03, 0.05])  # metres
+_TURN = np.array([0.3, -0.4, 0.5])  # radians about the axes of what hangs on a ball joint
+_STILL = 1e-5  # metres, and parts of an axis, that what stands may seem to move in a step
 _LEAST_MOVED = 1e-3  # metres that a thing must have moved to be told from others
 
 
@@ -63,6 +65,7 @@ class Observed:
         later: the same, (n, nbody, 12), once bodies are where the joints say: after a step MuJoCo
             has them where they were before its last one.
         sites: positions of sites, (n, nsite, 3) metres.
+        episodes: in which each was seen, (n,).
         model: the last reset's.
     """
 
@@ -73,26 +76,26 @@ class Observed:
     rotations: np.ndarray
     later: np.ndarray
     sites: np.ndarray
+    episodes: np.ndarray
     model: mujoco.MjModel
 
 
-def observe(env: gym.Env, n_resets: int = N_RESETS, n_steps: int = N_STEPS) -> Observed:
+def observe(env: gym.Env) -> Observed:
     """Watch how some episodes begin, some random steps, and where things go that are nudged.
 
     At random a robot hardly touches anything: what never moved could not be told apart.
 
     Args:
         env: with Dict goal observations; resets and steps are done in it.
-        n_resets: episodes that are begun, >= 1.
-        n_steps: random steps after the last reset, >= 0.
 
     Raises:
         ValueError: there is no MuJoCo simulation in it.
     """
     env.action_space.seed(0)
     rows: list[tuple[np.ndarray, ...]] = []
+    episodes: list[int] = []
 
-    def keep(obs: dict[str, np.ndarray]) -> None:
+    def keep(obs: dict[str, np.ndarray], episode: int) -> None:
         model, data = physics_of(env)
         now = placed(model, data)
         goals = (np.array(obs[key], np.float64) for key in ("achieved_goal", "desired_goal"))
@@ -100,38 +103,52 @@ def observe(env: gym.Env, n_resets: int = N_RESETS, n_steps: int = N_STEPS) -> O
         frames = data.xmat.reshape(-1, 3, 3).copy()
         later = np.concatenate([now.xpos, now.xmat], axis=1)
         rows.append((*goals, seen, data.xpos.copy(), frames, later, data.site_xpos.copy()))
+        episodes.append(episode)
 
-    for seed in range(n_resets):
-        obs, _ = env.reset(seed=seed)
-        keep(obs)
-    for _ in range(n_steps):
+    for episode in range(N_RESETS):
+        obs, _ = env.reset(seed=episode)
+        keep(obs, episode)
+    for _ in range(N_STEPS):
         obs, _, ended, truncated, _ = env.step(env.action_space.sample())
-        keep(obs)
+        keep(obs, episode)
         if ended or truncated:
             obs, _ = env.reset()
+            episode += 1
     for root in _passive_roots(physics_of(env)[0]):
         env.reset(seed=0)
         _nudge(*physics_of(env), root)
-        keep(env.step(np.zeros_like(env.action_space.sample()))[0])
+        episode += 1
+        keep(env.step(np.zeros_like(env.action_space.sample()))[0], episode)
     columns = [np.stack(column) for column in zip(*rows, strict=True)]
     achieved, desired, told, positions, rotations, later, sites = columns
-    model = physics_of(env)[0]
-    return Observed(achieved, desired, told, positions, rotations, later, sites, model)
+    when, model = np.array(episodes), physics_of(env)[0]
+    return Observed(achieved, desired, told, positions, rotations, later, sites, when, model)
+
+
+def check_standing(seen: Observed) -> None:
+    """Raise a ValueError where what stands and can be touched moves within an episode."""
+    model = seen.model
+    steps = np.flatnonzero(seen.episodes[1:] == seen.episodes[:-1])
+    moved = np.abs(seen.later[steps + 1] - seen.later[steps]).max(axis=(0, 2), initial=0.0)
+    stands = standing(model) & ~robot_bodies(model)
+    touching = np.unique(model.geom_bodyid[touching_geoms(model)])
+    for body in map(int, touching):
+        if stands[body] and moved[body] > _STILL:
+            raise ValueError(
+                f"body {body_name(model, body)} moves within an episode without a joint, which the "
+                "object's scene cannot follow; give it a joint, or let it touch nothing"
+            )
 
 
 def candidates(seen: Observed) -> list[Candidate]:
-    """Every body with a joint above it, the best match of each rigid group, best first."""
+    """Every body with joints of its own, the best match first."""
     model, robot = seen.model, robot_bodies(seen.model)
-    best: dict[int, Candidate] = {}
-    for body in range(1, model.nbody):
-        root = carrier(model, body)
-        if root == 0:
-            continue
-        offset, error = _fixed_point(seen, root)
-        name = body_name(model, body)
-        if root not in best:
-            best[root] = Candidate(root, name, offset, error, bool(robot[root]))
-    return sorted(best.values(), key=lambda each: each.error)
+    found = [
+        Candidate(body, body_name(model, body), *_fixed_point(seen, body), bool(robot[body]))
+        for body in range(1, model.nbody)
+        if carrier(model, body) == body
+    ]
+    return sorted(found, key=lambda each: each.error)
 
 
 def find_object(seen: Observed, wanted: str | None = None) -> Candidate:
@@ -210,15 +227,19 @@ def _passive_roots(model: mujoco.MjModel) -> list[int]:
 
 def _nudge(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> None:
     """Move a body along its joints: a free one up and aside, others into their range."""
-    first = int(model.body_jntadr[body])
+    kinds, first = mujoco.mjtJoint, int(model.body_jntadr[body])
     for joint in range(first, first + int(model.body_jntnum[body])):
-        adr = int(model.jnt_qposadr[joint])
-        if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE):
+        adr, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
+        low, high = model.jnt_range[joint]
+        if kind == int(kinds.mjJNT_FREE):
             data.qpos[adr : adr + 3] += _NUDGE
-        elif int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_BALL):
-            low, high = model.jnt_range[joint]
-            limited = bool(model.jnt_limited[joint])
-            data.qpos[adr] = (low + high) / 2 if limited else data.qpos[adr] + _NUDGE[2]
+        elif kind == int(kinds.mjJNT_BALL):
+            mujoco.mju_quatIntegrate(data.qpos[adr : adr + 4], _TURN, 1.0)
+        elif model.jnt_limited[joint]:  # a quarter off the end that is farther
+            nearer_low = data.qpos[adr] - low < high - data.qpos[adr]
+            data.qpos[adr] = high - (high - low) / 4 if nearer_low else low + (high - low) / 4
+        else:
+            data.qpos[adr] += _NUDGE[2]
     mujoco.mj_forward(model, data)
 
 
@@ -240,9 +261,9 @@ def _fixed_point(seen: Observed, body: int) -> tuple[np.ndarray, float]:
 
 def _named(seen: Observed, found: list[Candidate], wanted: str) -> Candidate:
     model = seen.model
-    known = {str(model.body(body).name): body for body in range(1, model.nbody)}
+    known = {str(model.site(s).name): int(model.site_bodyid[s]) for s in range(model.nsite)}
     known |= {str(model.geom(g).name): int(model.geom_bodyid[g]) for g in range(model.ngeom)}
-    known |= {str(model.site(s).name): int(model.site_bodyid[s]) for s in range(model.nsite)}
+    known |= {str(model.body(body).name): body for body in range(1, model.nbody)}
     names = ", ".join(each.name for each in found if not each.of_robot)
     if wanted not in known:
         raise ValueError(f"the scene has no body {wanted!r}; those that can move are {names}")

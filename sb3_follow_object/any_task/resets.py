@@ -104,31 +104,77 @@ def record_resets(env: gym.Env, n: int) -> tuple[Resets, mujoco.MjModel, mujoco.
 def check_same_shapes(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
     """Raise a ValueError where an episode's model has other shapes than the first one's.
 
-    The object's scene is made of the first. What stands elsewhere in it are bodies; the robot may
-    change as it likes, and so may what touches nothing.
+    The object's scene is made of the first. What stands elsewhere in it are bodies without joints;
+    what has joints is elsewhere by their positions. The robot may change as it likes, and so may
+    what touches nothing.
     """
     if (first.nbody, first.ngeom, first.nq) != (model.nbody, model.ngeom, model.nq):
         raise ValueError(
             "its model has other bodies, geoms or joints in other episodes; the object's scene "
             "needs the same in all: move what is not wanted out of the way"
         )
+    _check_hung(first, model)
     for what, name in _SHAPES.items():
-        differ = (
-            np.abs(getattr(first, name) - getattr(model, name)).max(axis=1, initial=0.0) > _SAME
+        differ = _differing(first, model, name)
+        if differ.any():  # in few resets
+            _refuse_geoms(first, model, differ, what)
+    heights = first.nhfielddata, model.nhfielddata
+    if heights[0] != heights[1] or _differing(first, model, "hfield_data").any():
+        fields = first.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD)
+        _refuse_geoms(first, model, fields, "height field")
+
+
+_SHAPES = {
+    "type": "geom_type",
+    "place": "geom_pos",
+    "turn": "geom_quat",
+    "size": "geom_size",
+    "mesh or height field": "geom_dataid",
+    "contype": "geom_contype",
+    "conaffinity": "geom_conaffinity",
+}
+
+
+def _differing(first: mujoco.MjModel, model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Which rows of a model's field are others than the first one's, bool (n,)."""
+    one, other = getattr(first, name), getattr(model, name)
+    off = np.abs(np.subtract(one, other, dtype=np.float64)) > _SAME
+    differ: np.ndarray = off.any(axis=1) if off.ndim == 2 else off
+    return differ
+
+
+def _refuse_geoms(
+    first: mujoco.MjModel, model: mujoco.MjModel, differ: np.ndarray, what: str
+) -> None:
+    """Raise a ValueError where geoms that differ can be touched and are not the robot's."""
+    touching = touching_geoms(first) | touching_geoms(model)
+    matter = touching & ~robot_bodies(first)[first.geom_bodyid]
+    for geom in map(int, np.flatnonzero(matter & differ)):
+        of = body_name(first, int(first.geom_bodyid[geom]))
+        raise ValueError(
+            f"geom {first.geom(geom).name or geom} of body {of} has another {what} in other "
+            "episodes, which the object's scene cannot follow; give it a body of its own, and "
+            "move that"
         )
-        if not differ.any():  # as in most resets
-            continue
-        matter = touching_geoms(first) & ~robot_bodies(first)[first.geom_bodyid]
-        for geom in map(int, np.flatnonzero(matter & differ)):
-            of = body_name(first, int(first.geom_bodyid[geom]))
-            raise ValueError(
-                f"geom {first.geom(geom).name or geom} of body {of} has another {what} in other "
-                "episodes, which the object's scene cannot follow; give it a body of its own, and "
-                "move that"
-            )
 
 
-_SHAPES = {"place": "geom_pos", "turn": "geom_quat", "size": "geom_size"}
+def _check_hung(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
+    """Raise a ValueError where what joints move hangs elsewhere than in the first model."""
+    differ = _differing(first, model, "body_pos") | _differing(first, model, "body_quat")
+    differ &= ~standing(first)
+    if not differ.any():  # as in most resets
+        return
+    of_free = first.jnt_bodyid[first.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]
+    differ[of_free] = False  # their joint alone says where they are
+    matter = np.zeros(first.nbody, dtype=bool)
+    matter[first.geom_bodyid[touching_geoms(first)]] = True
+    matter[first.jnt_bodyid] = True
+    for body in map(int, np.flatnonzero(differ & matter & ~robot_bodies(first))):
+        raise ValueError(
+            f"body {body_name(first, body)}, which joints move, hangs elsewhere in other episodes, "
+            "which the object's scene cannot follow; hang it on a body without joints, and move "
+            "that"
+        )
 
 
 def varying_bodies(model: mujoco.MjModel, resets: Resets) -> frozenset[int]:

@@ -18,6 +18,7 @@ from .resets import Resets, varying_bodies
 STEP = 0.04  # seconds of an env step, as in the package's own tasks
 POINT, PULLER = "followed:point", "followed:mocap"
 _LEAST_MASS = 1e-9  # kg
+_OFF = 2e-3  # metres that an episode here may begin off the task's; its point is known to 1 mm
 # Fields of a model that decide no object's motion; every other one is taken to.
 _NO_PHYSICS = re.compile(
     r"""
@@ -50,7 +51,7 @@ class DerivedTask:
     name: str
     horizon: int
     physics: str
-    tube: tuple[()] = ()
+    tube: tuple[()] = ()  # of no use, but checkpoints hold the task's repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +80,6 @@ class DerivedScene:
     substeps: int
     success_distance: float
     context: tuple[str, ...] = ()
-    alone: bool = True
-    time: float = 0.0
 
     def __deepcopy__(self, memo: dict[int, Any]) -> DerivedScene:
         return self
@@ -109,7 +108,8 @@ def object_scene_of(
         context: as in `DerivedScene`.
 
     Raises:
-        ValueError: the object has no mass, or the scene holds what cannot be copied.
+        ValueError: the object has no mass, the scene holds what cannot be copied, or the object is
+            elsewhere in it than in the task.
     """
     copied = transcribe(model, data, varying_bodies(model, resets))
     heavy = _heaviest(model, body)
@@ -120,7 +120,7 @@ def object_scene_of(
     alone = spec.compile()
     substeps = max(1, round(STEP / alone.opt.timestep))
     positions, velocities = _places_in(model, alone, copied)
-    return DerivedScene(
+    scene = DerivedScene(
         task,
         alone,
         int(alone.body(copied.bodies[heavy]).id),
@@ -132,6 +132,8 @@ def object_scene_of(
         success_distance,
         context,
     )
+    _check_starts(scene, resets)
+    return scene
 
 
 def physics_digest_of(
@@ -232,3 +234,27 @@ def _standing(alone: mujoco.MjModel, copied: Transcription, resets: Resets) -> n
         mocap = int(alone.body_mocapid[alone.body(copied.bodies[body]).id])
         places[:, mocap] = resets.places[:, body]
     return places
+
+
+def _check_starts(scene: DerivedScene, resets: Resets) -> None:
+    """Raise a ValueError where the object is elsewhere than in the episodes that were recorded.
+
+    Who reads a place right after a step has it a substep late, which counts as the same.
+    """
+    model, data = scene.model, mujoco.MjData(scene.model)
+    site, late = int(model.site(POINT).id), -model.opt.timestep
+    for episode, start in enumerate(resets.starts):
+        data.qpos[:] = scene.qpos[episode]
+        data.mocap_pos[:] = scene.mocap[episode, :, :3]
+        data.mocap_quat[:] = scene.mocap[episode, :, 3:]
+        mujoco.mj_kinematics(model, data)
+        off = np.linalg.norm(data.site_xpos[site] - start)
+        if off > _OFF:
+            mujoco.mj_integratePos(model, data.qpos, scene.qvel[episode], late)
+            mujoco.mj_kinematics(model, data)
+            off = min(off, np.linalg.norm(data.site_xpos[site] - start))
+        if off > _OFF:
+            raise ValueError(
+                f"an episode of the object's own scene begins {off * 1e3:.0f} mm off the task's "
+                f"(seed {episode}): joints and places of bodies must say where the achieved goal is"
+            )

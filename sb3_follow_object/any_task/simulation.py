@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
@@ -11,6 +13,7 @@ from ..envs.object_locomotion import ObjectSimulation
 from ..envs.physics_engine import mujoco
 from .context import located, place_numbers
 from .scene import POINT, PULLER, DerivedScene
+from .scene_picture import GOAL_RGBA, ScenePicture
 
 
 class DerivedSimulation(ObjectSimulation):
@@ -121,6 +124,25 @@ class DerivedObjectVecEnv(BatchVecEnv):
         """Gymnasium's spec of each copy, which says how long its episodes are."""
         task = self.simulation.scene.task
         return EnvSpec(task.name, max_episode_steps=self.horizon)
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """A picture (480, 480, 3) of every copy, its goal in red."""
+        picture = ScenePicture(self.model, self.simulation.scene.goals)
+        try:
+            pairs = zip(self.data, self.simulation.goals, strict=True)
+            return [picture.draw(data, goal[None], GOAL_RGBA[None]) for data, goal in pairs]
+        finally:
+            picture.close()
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        """As any VecEnv without a render mode.
+
+        Raises:
+            ValueError: a window is asked for.
+        """
+        if mode == "human":
+            raise ValueError("an object's own scene has no window; get_images() draws it")
+        return super().render(mode)
 
 
 def turned_about_vertical(quaternions: np.ndarray, first: np.ndarray) -> np.ndarray:

@@ -14,19 +14,13 @@ from ..envs.registration import import_task, registration_key
 from ..envs.robot_copies import robot_maker
 from ..envs.tasks import SUCCESS_DISTANCE
 from .context import bodies_in
-from .derived import derived, object_horizon, told_effector
+from .derived import derived, object_horizon, raised_by, told_effector
 from .finding import Effector, find_effector, observe
 from .physics_access import is_simulated
 from .simulation import DerivedObjectVecEnv
 
 SURFACE_STEPS = 120_000  # env steps after which an object left on its surface may leave it
 _LEAST_TO_REACH = 25  # env steps
-
-
-def check_followable(env_id: str) -> None:
-    """Raise a ValueError with the reason if a task's object cannot be followed."""
-    if env_id not in IDS:
-        derived(env_id)
 
 
 def what_is_followed(env_id: str) -> str:
@@ -78,9 +72,11 @@ def kept_as(env_id: str) -> str:
     Raises:
         ValueError: its object cannot be followed.
     """
-    context = context_of_task(env_id)
+    if env_id in IDS:
+        return physics_id(env_id)
+    context = derived(env_id).context
     told = hashlib.sha256(" ".join(context).encode()).hexdigest()[:6]
-    return physics_of_task(env_id) + (f"-{told}" if context else "")
+    return derived(env_id).kept_as + (f"-{told}" if context else "")
 
 
 def surface_choices(env_id: str, setting: bool | None = None) -> tuple[bool, ...]:
@@ -160,6 +156,10 @@ def _find_effector(env_id: str) -> tuple[int, int, int] | None:
         if missing_goal_keys(env.observation_space) or not is_simulated(env):
             return None
         return _told(env_id, find_effector(observe(env), told_effector(env)))
+    except ValueError:
+        raise
+    except Exception as error:  # an environment of somebody's may raise anything
+        raise raised_by(env_id, error) from error
     finally:
         env.close()
 

@@ -19,6 +19,7 @@ from ..envs.goal_space import goal_space
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
 from ..imagination.goal_predictor import GoalPredictor
+from ..replay.steps import check_actions
 from ..runs.predictor_cache import kept_predictor
 from .pictures import imagined_panels, write_png
 
@@ -39,12 +40,13 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
         report: told what takes long.
 
     Raises:
-        ValueError: its object cannot be followed, with the reason.
+        ValueError: its object cannot be followed, or its actions have no bounds.
     """
     name = import_task(env_id)
     if name in IDS:
         raise ValueError(f"{name!r} is a task of this package; inspect is for those of others")
     found = derived(name, report)
+    _check_actions(name)
     return {
         "object": _object(found),
         "goal": _goal(found),
@@ -57,6 +59,16 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
         "steps a second": f"object {_object_speed(found):,.0f}, robot {_robot_speed(name):,.0f}",
         "physics": found.physics,
     }
+
+
+def _check_actions(env_id: str) -> None:
+    env: gym.Env = robot_maker(env_id)()
+    try:
+        check_actions(env.action_space)
+    except ValueError as error:
+        raise ValueError(f"{env_id!r}: {error}") from error
+    finally:
+        env.close()
 
 
 def draw_found(env_id: str, out: Path, predictor: str | os.PathLike[str] | None = None) -> None:

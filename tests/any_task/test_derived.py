@@ -18,6 +18,7 @@ from sb3_follow_object.any_task import derived as module
 from sb3_follow_object.any_task.derived import Derived, derived
 from sb3_follow_object.any_task.resets import record_resets
 from sb3_follow_object.any_task.simulation import DerivedObjectVecEnv, turned_about_vertical
+from sb3_follow_object.any_task.tasks import effector_seen_in, kept_as
 from sb3_follow_object.common.cache import CACHE_VARIABLE
 from sb3_follow_object.settings.presets import run_config
 
@@ -177,8 +178,197 @@ class EndsOnSlides(EndsThere):
         return self._observation(), {}
 
 
+PARTED = """
+<mujoco>
+  <worldbody>
+    <body name="finger" pos="0 0 0.3">
+      <joint name="turn" axis="0 0 1"/><geom size="0.02" mass="0.1"/><site name="tip"/>
+    </body>
+    <body name="sledge">
+      <joint name="x" type="slide" axis="1 0 0"/><geom size="0.01" mass="0.1"/>
+      <body name="puck" pos="0 0 0.1">
+        <joint name="y" type="slide" axis="0 1 0"/><geom size="0.02" mass="0.1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position joint="turn"/></actuator>
+</mujoco>
+"""
+BALLS = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="finger" pos="0 0 0.6">
+      <joint name="turn" axis="0 0 1"/><geom size="0.02" mass="0.1"/><site name="tip"/>
+    </body>
+    <body name="pole">
+      <joint name="ball" type="ball"/><geom size="0.02" pos="0.2 0 0" mass="0.1"/>
+    </body>
+  </worldbody>
+  <actuator><position joint="turn"/></actuator>
+</mujoco>
+"""
+
+
+class EndsOnParents(EndsOnSlides):
+    """A puck on one slide, the other being its parent's."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model = mujoco.MjModel.from_xml_string(PARTED)
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.goal[2] = 0.1
+        return self._observation(), {}
+
+
+class EndsTruncated(EndsOnSlides):
+    """Says of the goal that the time is over."""
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, terminated, _, info = super().step(action)
+        return obs, reward, False, terminated, info
+
+
+class EndsOnBall(EndsOnSlides):
+    """The end of a pole on a ball joint."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model = mujoco.MjModel.from_xml_string(BALLS)
+        self.data, self.body = mujoco.MjData(self.model), "pole"
+        self.offset = np.array([0.2, 0.0, 0.0])
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        way = self.np_random.uniform([-1.0, 0.5, 0.5], 1.0)
+        self.goal = 0.2 * way / np.linalg.norm(way)
+        return self._observation(), {}
+
+
+class PlacedPuck(EndsOnSlides):
+    """The puck begins where its body is moved to."""
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, _, _, info = super().step(action)
+        return obs, reward, False, False, info
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.model.body("puck").pos[:2] = self.np_random.uniform(-0.1, 0.1, 2)
+        mujoco.mj_forward(self.model, self.data)
+        return self._observation(), {}
+
+
+class MovedSlide(PlacedPuck):
+    """The puck begins where the zero of its slide is moved to."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        EndsOnSlides.reset(self, seed=seed)
+        self.model.qpos0[self.model.joint("x").qposadr[0]] = self.np_random.uniform(-0.1, 0.1)
+        mujoco.mj_forward(self.model, self.data)
+        return self._observation(), {}
+
+
+class MovedDrawer(Tidy):
+    """The drawer, which is not the object, is moved by its body."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.model.body("drawer").pos[0] = self.np_random.uniform(-0.1, 0.1)
+        mujoco.mj_forward(self.model, self.data)
+        return self._observation(), {}
+
+
+class SwitchedOff(Tidy):
+    """Its shelf can be touched in half of the episodes."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        shelf = self.model.body("shelf").geomadr[0]
+        on = 0 if seed is None else seed % 2
+        self.model.geom_contype[shelf] = self.model.geom_conaffinity[shelf] = on
+        return super().reset(seed=seed)
+
+
+class Reshaped(Tidy):
+    """Its shelf is a ball in half of the episodes."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        kinds = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
+        shelf = self.model.body("shelf").geomadr[0]
+        self.model.geom_type[shelf] = kinds[(seed or 0) % 2]
+        return super().reset(seed=seed)
+
+
+HILLS = KITCHEN.replace(
+    "<asset>", '<asset><hfield name="hills" nrow="2" ncol="2" size="1 1 .1 .1"/>'
+).replace(
+    "<worldbody>", '<worldbody><geom name="hills" type="hfield" hfield="hills" pos="0 0 -1"/>', 1
+)
+
+
+class Hilly(Tidy):
+    """Its ground has other hills in each episode."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model = mujoco.MjModel.from_xml_string(HILLS)
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        found = super().reset(seed=seed)
+        self.model.hfield_data[:] = self.np_random.uniform(0.0, 1.0, 4)
+        return found
+
+
+GATE = '<body name="gate" mocap="true" pos="1 1 1"><geom type="box" size=".1 .1 .1"/></body>'
+
+
+class Gated(Tidy):
+    """A gate moves up and down."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        spec = KITCHEN.replace("</worldbody>", f"{GATE}</worldbody>")
+        self.model = mujoco.MjModel.from_xml_string(spec)
+        self.data = mujoco.MjData(self.model)
+
+    def step(self, action: np.ndarray) -> Any:
+        self.data.mocap_pos[1, 2] = 1.0 + 0.1 * np.sin(self.data.time)
+        return super().step(action)
+
+
+class Raises(Tidy):
+    """Looks up what it does not know once the drawer is open."""
+
+    def step(self, action: np.ndarray) -> Any:
+        if self.data.joint("rail").qpos[0] > 0.05:
+            raise KeyError("open")
+        return super().step(action)
+
+
+class Odd(Tidy):
+    """Has a number of the name of its method beside one that answers in columns."""
+
+    is_success = False  # type: ignore[assignment]
+
+    def _is_success(self, achieved: np.ndarray, desired: np.ndarray) -> Any:
+        return np.linalg.norm(achieved - desired, axis=-1, keepdims=achieved.ndim > 1) < 0.03
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, _, _, _, _ = Kitchen.step(self, action)
+        success = bool(self._is_success(obs["achieved_goal"], obs["desired_goal"]))
+        return obs, success - 1.0, False, False, {"is_success": success}
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        return Tidy.is_success(self, achieved, desired) - 1.0
+
+
 KINDS = (Tidy, Lifting, Massless, Dense, Posed, NoPhysics, EndsThere, EndsOpen)
-KINDS += (MovedGeom, Rebuilt, Buttons, EndsOnSlides)
+KINDS += (MovedGeom, Rebuilt, Buttons, EndsOnSlides, EndsOnParents, EndsTruncated, EndsOnBall)
+KINDS += (PlacedPuck, MovedSlide, MovedDrawer, SwitchedOff, Reshaped, Hilly, Gated, Raises, Odd)
 for kind in KINDS:
     gym.register(f"{kind.__name__}-v0", kind, max_episode_steps=40, disable_env_checker=True)
 gym.register("Timeless-v0", Tidy, disable_env_checker=True)
@@ -380,6 +570,20 @@ def test_what_no_seed_says_again_is_no_part_of_the_physics(monkeypatch: pytest.M
         ("EndsThere-v0", "'EndsThere-v0': it ends its episodes at the goal; imagined goals need"),
         ("EndsOpen-v0", "'EndsOpen-v0': it ends its episodes at the goal; imagined goals need"),
         ("EndsOnSlides-v0", "'EndsOnSlides-v0': it ends its episodes at the goal; imagined"),
+        ("EndsOnParents-v0", "'EndsOnParents-v0': it ends its episodes at the goal; imagined"),
+        ("EndsTruncated-v0", "'EndsTruncated-v0': it ends its episodes at the goal; imagined"),
+        ("EndsOnBall-v0", "'EndsOnBall-v0': it ends its episodes at the goal; imagined"),
+        ("PlacedPuck-v0", "body puck, which joints move, hangs elsewhere in other episodes, .*"),
+        (
+            "MovedSlide-v0",
+            r"'MovedSlide-v0': an episode .* begins \d+ mm off the task's \(seed 1\)",
+        ),
+        ("MovedDrawer-v0", "body drawer, which joints move, hangs elsewhere in other episodes"),
+        ("SwitchedOff-v0", r"geom \d+ of body shelf has another contype in other episodes"),
+        ("Reshaped-v0", r"geom \d+ of body shelf has another type in other episodes"),
+        ("Hilly-v0", "geom hills of body world has another height field in other episodes"),
+        ("Gated-v0", "body gate moves within an episode without a joint, which the object's"),
+        ("Raises-v0", "'Raises-v0' raised KeyError: 'open' while it was reset and stepped and"),
         (
             "MovedGeom-v0",
             r"'MovedGeom-v0': geom \d+ of body shelf has another place in other .* give it a body",
@@ -396,6 +600,55 @@ def test_what_cannot_be_followed_is_refused_in_one_sentence(env_id: str, sentenc
     with pytest.raises(ValueError, match=sentence) as caught:
         derived(env_id)
     assert "\n" not in str(caught.value)
+
+
+def test_success_is_what_a_method_says_in_columns_too() -> None:
+    assert derived("Odd-v0").success_distance == pytest.approx(0.03, abs=1e-4)
+
+
+def test_an_error_is_told_in_one_sentence_where_only_the_effector_is_looked_for() -> None:
+    with pytest.raises(ValueError, match="'Raises-v0' raised KeyError: 'open' while it was reset"):
+        effector_seen_in("Raises-v0")
+
+
+def test_goals_that_no_seed_says_again_are_recorded_anew_once_they_are_elsewhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(0)
+    reset = Tidy.reset
+
+    def drawn_from(low: float) -> Derived:
+        def unseeded(env: Any, *, seed: int | None = None, options: Any = None) -> Any:
+            reset(env, seed=seed)
+            env.goal = rng.uniform([low, 0.0, 0.2], [low + 0.2, 0.1, 0.2])
+            return env._observation(), {}
+
+        monkeypatch.setattr(Tidy, "reset", unseeded)
+        module._LOOKED_AT.clear()
+        return derived("Tidy-v0", said.append)
+
+    said: list[str] = []
+    first, again = drawn_from(0.0), drawn_from(0.0)
+    np.testing.assert_array_equal(again.resets.goals, first.resets.goals)
+    assert len(said) == 1 and first.kept_as == first.physics
+    other = drawn_from(0.5)
+    assert other.resets.goals[:, 0].min() >= 0.5 and other.physics == first.physics
+    assert said[1].startswith("episodes of Tidy-v0 begin elsewhere now") and len(said) == 3
+    assert kept_as("Tidy-v0").startswith(f"{first.physics}.1-"), "and F_phi is another"
+    np.testing.assert_array_equal(drawn_from(0.5).resets.goals, other.resets.goals)
+    np.testing.assert_array_equal(drawn_from(0.0).resets.goals, first.resets.goals)
+
+
+def test_an_object_alone_is_drawn_and_has_no_window(can_draw: None) -> None:
+    env = alone(derived("Tidy-v0"), 2)
+    env.reset()
+    images = env.get_images()
+    assert [image.shape for image in images] == [(480, 480, 3)] * 2  # type: ignore[union-attr]
+    red, green, blue = np.moveaxis(images[0].astype(int), -1, 0)  # type: ignore[union-attr]
+    assert ((red > 2 * green) & (red > 2 * blue) & (red > 40)).sum() > 20, "the goal"
+    with pytest.raises(ValueError, match="has no window; get_images"):
+        env.render("human")
+    env.close()
 
 
 def test_resets_are_recorded_without_what_older_mujoco_lacks(

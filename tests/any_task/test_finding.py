@@ -10,8 +10,9 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from scenes import fingers, kitchen
+from scenes import KITCHEN, fingers, kitchen
 
+from sb3_follow_object.any_task import finding
 from sb3_follow_object.any_task.finding import Observed, find_effector, find_object, observe
 from sb3_follow_object.envs.registration import import_task
 
@@ -168,6 +169,38 @@ def test_bodies_that_move_alike_are_told_apart_by_their_name() -> None:
     with pytest.raises(ValueError, match=r"several bodies move with .*: mug, empty root; name one"):
         find_object(seen)
     assert find_object(seen, "empty root").name == "empty root"
+
+
+def test_a_bodys_name_comes_before_a_sites() -> None:
+    env = Kitchen("mug")
+    spec = mujoco.MjSpec.from_string(KITCHEN)
+    next(body for body in spec.bodies if body.name == "load").add_site(name="mug")
+    env.model = spec.compile()
+    env.data = mujoco.MjData(env.model)
+    assert find_object(observe(env), "mug").error < 1e-6
+
+
+HALFWAY = """
+<mujoco>
+  <worldbody>
+    <body name="drawer"><joint name="rail" type="slide" range="-1 1" limited="true"/>
+      <geom size=".1"/></body>
+    <body name="ball" pos="1 0 0"><joint name="ball" type="ball"/><geom size=".1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_what_rests_halfway_or_on_a_ball_is_moved_too() -> None:
+    model = mujoco.MjModel.from_xml_string(HALFWAY)
+    data = mujoco.MjData(model)
+    finding._nudge(model, data, model.body("drawer").id)
+    assert abs(data.joint("rail").qpos[0]) == pytest.approx(0.5)
+    finding._nudge(model, data, model.body("drawer").id)
+    assert abs(data.joint("rail").qpos[0]) == pytest.approx(0.5), "now at the other end"
+    finding._nudge(model, data, model.body("ball").id)
+    assert data.joint("ball").qpos[0] < 0.98
+    assert np.linalg.norm(data.joint("ball").qpos) == pytest.approx(1.0)
 
 
 def test_a_gripper_that_is_the_goal_is_refused() -> None:

@@ -183,6 +183,19 @@ def test_what_is_registered_again_is_looked_at_once(monkeypatch: pytest.MonkeyPa
     assert len(deriving._LOOKED_AT) == 3, "and what the old one was is forgotten"
 
 
+def test_an_id_that_is_registered_with_another_length_is_looked_at_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(deriving, "_LOOKED_AT", {})
+    monkeypatch.setattr(deriving, "_look", lambda name, report: gym.spec(name).max_episode_steps)
+    told = []
+    for horizon in (30, 40):
+        gym.registry.pop("Again-v0", None)
+        gym.register("Again-v0", arm_and_wall.ArmAndWall, max_episode_steps=horizon)  # type: ignore[attr-defined]
+        told.append(derived("Again-v0"))
+    assert told == [30, 40]
+
+
 def test_ids_without_a_version_or_with_a_namespace_keep_their_name() -> None:
     for env_id in ("Unversioned", "mine/Spaced-v3"):
         gym.register(env_id, arm_and_wall.ArmAndWall, max_episode_steps=30)  # type: ignore[attr-defined]

@@ -38,7 +38,7 @@ def test_an_object_thrown_alone_moves_as_in_the_whole_scene(
     pytest.importorskip(package, reason=f"{package} is installed by itself (docs/robots.md)")
     monkeypatch.setattr(sys, "path", [str(ROOT / "benchmarks" / "robots"), *sys.path])
     env = gym.make(import_task(env_id))
-    seen = observe(env, n_resets=5, n_steps=5)
+    seen = observe(env)
     wanted = (
         env.get_wrapper_attr("followed_object") if env.has_wrapper_attr("followed_object") else None
     )

@@ -68,6 +68,22 @@ def test_a_robot_without_the_time_to_get_there_is_told(capsys: pytest.CaptureFix
     assert line.endswith("too slow: make episodes longer, or do each action more than once")
 
 
+class Unbounded(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
+    """Takes any number for an action."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.action_space = gym.spaces.Box(-np.inf, np.inf, (3,))
+
+
+gym.register("Unbounded-v0", Unbounded, max_episode_steps=50)
+
+
+def test_actions_without_bounds_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", "--env", "Unbounded-v0"]) == 2
+    assert "'Unbounded-v0': the action space must have finite bounds" in capsys.readouterr().err
+
+
 def test_a_goal_as_high_as_the_start_is_no_minus_above_it() -> None:
     starts = np.array([[0.0, 0.0, 0.425], [0.1, 0.0, 0.425]])
     resets = SimpleNamespace(starts=starts, goals=starts + np.array([0.3, 0.0, -1e-6]))

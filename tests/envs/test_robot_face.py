@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import toy
 
-from sb3_follow_object.envs.goal_envs import check_task
+from sb3_follow_object.envs.goal_envs import check_task, success_method
 from sb3_follow_object.envs.robot_face import RobotTask, needs_face
 
 
@@ -209,3 +209,18 @@ def test_what_tells_too_little_is_refused(make: Any, sentence: str) -> None:
 def test_what_answers_already_is_left_as_it_is() -> None:
     assert not needs_face(toy.PointEnv())
     assert check_task("ZeroOne-v0") == "ZeroOne-v0", "what it lacks can be added"
+
+
+class Odd(toy.PointEnv):
+    """Has a number of the name of its method."""
+
+    is_success = False  # type: ignore[assignment]
+
+    def _is_success(self, achieved: np.ndarray, desired: np.ndarray) -> Any:
+        return np.linalg.norm(achieved - desired, axis=-1) <= toy.THRESHOLD
+
+
+def test_what_has_the_name_of_a_method_and_is_none_does_not_count() -> None:
+    assert success_method(toy.PointEnv().get_wrapper_attr) == "is_success"
+    assert success_method(Odd().get_wrapper_attr) == "_is_success"
+    assert success_method(Mute().get_wrapper_attr) is None

@@ -172,3 +172,98 @@ def test_a_weld_pulls_the_part_that_has_the_mass() -> None:
         before = state.xpos[load][2]
         mujoco.mj_step(alone, state, 20)
     assert state.xpos[load][2] - before > 0.02, "it follows within a step of 0.04 s"
+
+
+HILLS = """
+<mujoco>
+  <asset>
+    <hfield name="hills" nrow="3" ncol="3" size="1 1 2 .1" elevation="0 .5 .2 1 0 .3 .1 .2 .4"/>
+  </asset>
+  <worldbody>
+    <geom type="hfield" hfield="hills" pos="0 0 .3" euler="0 20 0"/>
+    <body name="ball" pos="0 0 2"><freejoint/><geom size=".05"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (0.1, 0.2), (0.3, 0.3), (0.0, 0.0)])
+def test_heights_that_an_environment_has_written_are_kept(low: float, high: float) -> None:
+    model = mujoco.MjModel.from_xml_string(HILLS)
+    model.hfield_data[:] = low + (high - low) * model.hfield_data
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    alone, state = passive(model, data)
+    mujoco.mj_forward(alone, state)
+    hit = np.zeros(1, np.int32)
+    for x, y in np.random.default_rng(0).uniform(-0.6, 0.6, (20, 2)):
+        for start, way in ((3.0, -1.0), (-3.0, 1.0)):  # from above, and from below
+            ray = np.array([x, y, start]), np.array([0.0, 0.0, way]), None, 1, -1, hit
+            there, here = mujoco.mj_ray(model, data, *ray), mujoco.mj_ray(alone, state, *ray)
+            assert there > 0.0 and here == pytest.approx(there, abs=1e-6)
+
+
+TIED = """
+<mujoco>
+  <worldbody>
+    <body name="arm" pos="0 0 2"><joint name="turn"/><geom size=".1"/><site name="tip"/></body>
+    <body name="one" pos="0 0 1">
+      <freejoint/><geom size=".1" mass="1"/><site name="right" pos=".2 0 0"/>
+    </body>
+    <body name="two" pos=".5 0 1">
+      <joint name="slide" type="slide"/><geom size=".1" mass="1"/><site name="left" pos="-.2 0 0"/>
+    </body>
+    <body name="three" pos="1 0 1"><joint name="hinge"/><geom size=".1" pos=".1 0 0"/></body>
+  </worldbody>
+  THINGS
+  <actuator><position joint="turn"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("kind", ["weld", "connect"])
+def test_what_is_tied_by_sites_stays_tied(kind: str) -> None:
+    tie = f'<equality><{kind} site1="right" site2="left"/><{kind} site1="tip" site2="left"/>'
+    model = mujoco.MjModel.from_xml_string(TIED.replace("THINGS", f"{tie}</equality>"))
+    model.eq_active0[1] = 0  # the robot lets go
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    alone, state = passive(model, data)
+    assert alone.neq == 1
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+        mujoco.mj_step(alone, state)
+    name = alone.joint(0).name
+    np.testing.assert_allclose(state.joint(name).qpos, data.joint(1).qpos, atol=TENTH_OF_MM)
+    assert abs(data.joint("slide").qpos[0]) > 1e-3, "it was pulled"
+
+
+CORD = '<tendon><fixed name="cord" {}><joint joint="{}" coef="1"/><joint joint="hinge" coef="1"/>'
+CORD += "</fixed></tendon>"
+
+
+def test_a_tendon_between_passive_joints_is_refused() -> None:
+    def tied(things: str) -> None:
+        passive(*_begun(mujoco.MjModel.from_xml_string(TIED.replace("THINGS", things))))
+
+    wire = '<tendon><spatial {}><site site="left"/><site site="{}"/></spatial></tendon>'
+    for refused in (
+        CORD.format('stiffness="1"', "slide"),
+        CORD.format('damping="1"', "slide"),
+        CORD.format('limited="true" range="0 1"', "slide"),
+        CORD.format("", "slide") + '<equality><tendon tendon1="cord"/></equality>',
+        wire.format('frictionloss="1"', "right"),
+    ):
+        with pytest.raises(
+            ValueError, match=r"tendon \w+ pulls at \w+ and at nothing of the robot"
+        ):
+            tied(refused)
+    tied(CORD.format("", "slide"))  # nothing but measured
+    tied(CORD.format('stiffness="1"', "turn"))  # the robot's
+    tied(wire.format('stiffness="1"', "tip"))
+
+
+def _begun(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
