@@ -98,7 +98,10 @@ def _stacked(rows: list[dict[str, Any]]) -> dict[str, np.ndarray]:
 
 def serve(pipe: Connection) -> None:
     """Answer what the other end asks until it is gone."""
-    path, maker, n = pipe.recv()
+    try:
+        path, maker, n = pipe.recv()
+    except (EOFError, ConnectionError):
+        return
     sys.path[:] = path
     copies, number = None, 0
     try:

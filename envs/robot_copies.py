@@ -7,10 +7,11 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection
-from socket import socketpair
+from socket import SHUT_RDWR, socket, socketpair
 from typing import Any, NoReturn, cast
 
 import cloudpickle
@@ -21,6 +22,7 @@ from gymnasium.envs.registration import EnvCreator, EnvSpec, load_env_creator
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from ..common.numbers import checked_whole
+from ..common.reports import named_reason
 from .batch import cores
 from .copies_worker import NUMBER
 from .copies_worker import __name__ as WORKER
@@ -31,6 +33,7 @@ from .robotics import is_of_robotics
 from .task_table import IDS
 
 _LEAST = 2  # copies that are worth a process
+_CLOSING_S = 10.0  # seconds that a process has to close its copies
 # What judges goals and knows nothing of an episode, so that any copy may be asked.
 _JUDGES = ("compute_reward", "is_success", "_is_success")
 
@@ -154,21 +157,29 @@ class ProcessVecEnv(VecEnv):
         make: makes one copy; is sent to the processes by cloudpickle.
         n_envs: number of copies.
         n_workers: number of processes, at most `n_envs`.
+
+    Raises:
+        ValueError: `make` cannot be sent to the processes.
     """
 
     def __init__(self, make: Callable[[], gym.Env], n_envs: int, n_workers: int) -> None:
+        maker = _sendable(make)
         self._judge = make()
-        self._workers = [
-            _Worker(make, len(rows)) for rows in np.array_split(np.arange(n_envs), n_workers)
-        ]
         self._rows = np.array_split(np.arange(n_envs), n_workers)
         self._place = [(w, int(i)) for w, rows in enumerate(self._rows) for i in range(len(rows))]
         self._closed = False
-        for worker in self._workers:
-            worker.answer()  # all are making theirs at once
-        super().__init__(n_envs, self._judge.observation_space, self._judge.action_space)
-        self.metadata = self._judge.metadata
-        self._judge.reset(seed=0)  # some judge by what a reset has made
+        self._workers: list[_Worker] = []
+        try:
+            for rows in self._rows:
+                self._workers.append(_Worker(maker, len(rows)))
+            for worker in self._workers:
+                worker.answer()  # all are making theirs at once
+            super().__init__(n_envs, self._judge.observation_space, self._judge.action_space)
+            self.metadata = self._judge.metadata
+            self._judge.reset(seed=0)  # some judge by what a reset has made
+        except BaseException:
+            self.close()
+            raise
 
     def reset(self) -> dict[str, np.ndarray]:
         """Begin an episode in every copy; seeds set by `seed()` count from here."""
@@ -294,9 +305,13 @@ class _Worker:
     Questions are numbered, so that answers that nobody waited for, as an exception came between,
     are not taken for those to what is asked next. Signals to this process's group do not reach it:
     it ends when the line does.
+
+    Args:
+        maker: makes one copy, pickled by cloudpickle.
+        n: of them.
     """
 
-    def __init__(self, make: Callable[[], gym.Env], n: int) -> None:
+    def __init__(self, maker: bytes, n: int) -> None:
         ours, theirs = socketpair()
         self._process = subprocess.Popen(
             [sys.executable, "-m", WORKER, str(theirs.fileno())],
@@ -307,7 +322,7 @@ class _Worker:
         theirs.close()
         self._pipe = Connection(ours.detach())
         self._asked = 0
-        self._pipe.send((sys.path, cloudpickle.dumps(make), n))
+        self._pipe.send((sys.path, maker, n))
 
     def ask(self, name: str, *arguments: Any) -> None:
         self._send(cloudpickle.dumps((name, arguments)))
@@ -345,5 +360,26 @@ class _Worker:
         )
 
     def close(self) -> None:
+        # Closing does not end a line that a fork of this process holds open too.
+        with socket(fileno=os.dup(self._pipe.fileno())) as line, suppress(OSError):
+            line.shutdown(SHUT_RDWR)
         self._pipe.close()
-        self._process.wait()
+        try:
+            self._process.wait(_CLOSING_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _sendable(make: Callable[[], gym.Env]) -> bytes:
+    """Pickle what makes a copy.
+
+    Raises:
+        ValueError: it cannot be.
+    """
+    try:
+        return cloudpickle.dumps(make)
+    except Exception as error:  # what somebody's function holds may raise anything
+        raise ValueError(
+            f"the environment cannot be sent to processes ({named_reason(error)}); take n_threads=1"
+        ) from error

@@ -163,6 +163,7 @@ def _config(args: argparse.Namespace) -> RunConfig:
         file=args.config,
         seed=args.seed or 0,
         overrides=overrides_of(args),
+        report=(lambda sentence: None) if getattr(args, "quiet", False) else _warn,
     )
     for text in args.set:
         if why := unread(text.split("=")[0], config):

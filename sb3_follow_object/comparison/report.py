@@ -245,7 +245,7 @@ def _add_settings(page: _Page, folders: Sequence[tuple[str, Path]]) -> None:
     """Add the settings and versions of runs, those that they share once."""
     found = {name: flat(asdict(read_config(path))) for name, path in folders}
     versions = {
-        name: json.loads((path / VERSIONS).read_text("utf-8"))
+        name: _read_versions(path / VERSIONS)
         for name, path in folders
         if (path / VERSIONS).exists()
     }
@@ -267,6 +267,18 @@ def _add_settings(page: _Page, folders: Sequence[tuple[str, Path]]) -> None:
                 ["run", *others],
             )
             page.unfolded()
+
+
+def _read_versions(path: Path) -> dict[str, Any]:
+    """Return what a run was made with, by its name.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        return dict(json.loads(path.read_text("utf-8")))
+    except (OSError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} does not say what the run was made with ({error})") from error
 
 
 def _chart(

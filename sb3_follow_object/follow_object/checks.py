@@ -10,11 +10,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from ..any_task.tasks import object_vec_env, steps_of_object
 from ..common.torch_helpers import usable_device
-from ..ddpg.folding import AUTO
 from ..ddpg.her_ddpg import HerDDPG
-from ..object_stage.networks import SAY_NO_MIRRORS
+from ..object_stage.networks import check_readable
 from ..object_stage.sldr import task_of_package
 from ..reach.approach import BEHIND, check_reachable, reach_first_settings
+from ..replay.steps import refuse_margin
 from ..settings.fields import settings_of
 from ..settings.learning import PredictorSettings
 from ..settings.sizes import check_stages
@@ -36,7 +36,6 @@ def check_algorithms(
         ValueError: one cannot be built.
     """
     check_stages(settings["env_id"], settings, horizon)
-    usable_device(settings["predictor_fit"].get("device", PredictorSettings.device))
     if settings.get("reach") is not None:
         reach = reach_first_settings(reach_parts(settings)[0], "reach", None)
         check_reachable(env.observation_space, env.action_space, reach)
@@ -44,18 +43,37 @@ def check_algorithms(
     # What these two need is not there yet; their settings have been checked.
     if needs_networks:
         task_of_package(env)
-        mirrors = (settings["object_algorithm"].get("policy_kwargs") or {}).get("mirrors")
-        if mirrors not in (None, [], AUTO):
-            raise ValueError(SAY_NO_MIRRORS)
         del arguments["auxiliary"]
-    if settings["imagine"] and arguments.get("replay_buffer_kwargs"):
-        arguments["replay_buffer_kwargs"]["imagined_ratio"] = 0.0
+    replay = arguments.get("replay_buffer_kwargs") or {}
+    if settings["reward_type"] == "dense" and replay.get("goal_margin"):
+        refuse_margin()
+    if settings["imagine"] and replay:
+        replay["imagined_ratio"] = 0.0
     _check_algorithm(env, horizon, arguments)
     if settings["imagine"] or needs_networks:
-        env_id = settings["env_id"]
-        object_env, horizon = object_vec_env(env_id, 1), steps_of_object(env_id, horizon)
-        _check_algorithm(object_env, horizon, copy.deepcopy(settings["object_algorithm"]))
-        object_env.close()
+        check_object_stage(settings, horizon, needs_networks)
+
+
+def check_object_stage(settings: Mapping[str, Any], horizon: int, needs_networks: bool) -> None:
+    """Build the object's algorithm once, in small.
+
+    Args:
+        settings: `FollowObject`'s.
+        horizon: T, steps of the robot's episodes.
+        needs_networks: whether SLDR's reward will read the object's networks.
+
+    Raises:
+        ValueError: it cannot be built, or SLDR's reward could not read it.
+    """
+    usable_device(settings["predictor_fit"].get("device", PredictorSettings.device))
+    env_id, arguments = settings["env_id"], copy.deepcopy(settings["object_algorithm"])
+    env = object_vec_env(env_id, 1)
+    try:
+        model = _check_algorithm(env, steps_of_object(env_id, horizon), arguments)
+        if needs_networks:
+            check_readable(model.policy)
+    finally:
+        env.close()
 
 
 def reach_parts(
@@ -79,12 +97,12 @@ def reach_parts(
     return first, teaching
 
 
-def _check_algorithm(env: VecEnv, horizon: int, arguments: dict[str, Any]) -> None:
+def _check_algorithm(env: VecEnv, horizon: int, arguments: dict[str, Any]) -> HerDDPG:
     if (arguments.get("replay_buffer_kwargs") or {}).get("copy_info_dict"):
         raise ValueError("copy_info_dict cannot be set: checkpoints do not hold infos")
     small = {"policy": "MultiInputPolicy", "buffer_size": horizon * env.num_envs}
     try:
-        HerDDPG(env=env, **{**arguments, **small})
+        return HerDDPG(env=env, **{**arguments, **small})
     except ValueError:
         raise
     except Exception as error:  # SB3 and torch raise anything; so do others' environments

@@ -119,12 +119,12 @@ class FollowObject:
             is_success=is_success,
             effector=effector,
         )
-        self.settings = run_settings(full_id, method, preset, settings, lift, seed)
+        self.report = report or _say_nothing
+        self.settings = run_settings(full_id, method, preset, settings, lift, seed, self.report)
         self.env_id: str = self.settings["env_id"]
         self.full_id = full_id  # with the module that registers it, as given
         self.imagine: bool = self.settings["imagine"]
         self.seed: int = self.settings["seed"]
-        self.report = report or _say_nothing
         self.object_stage = ObjectStage(
             self.settings,
             self.report,
@@ -279,12 +279,23 @@ class FollowObject:
         return self
 
     def predict(
-        self, observation: dict[str, np.ndarray], deterministic: bool = True
-    ) -> tuple[np.ndarray, None]:
-        """Return the robot's actions, as SB3's `predict`."""
+        self,
+        observation: dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return the robot's actions and `state`; SB3's `evaluate_policy` takes it too.
+
+        Args:
+            observation: of one environment, or of a VecEnv's copies.
+            state: of a recurrent policy, which this is not.
+            episode_start: likewise.
+            deterministic: makes no difference: the policy itself has no noise.
+        """
         if self.model is None:
             raise ValueError("nothing has been learned yet: call learn() first")
-        return self.model.predict(observation, deterministic=deterministic)  # type: ignore
+        return self.model.predict(observation, state, episode_start, deterministic)
 
     # ---- saving -------------------------------------------------------------------------------
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, Literal
 
+from ..any_task.derived import derived
 from ..any_task.tasks import effector_of, effector_seen_in, steps_to_reach
 from ..common.numbers import checked_whole
+from ..common.reports import Report
 from ..envs import IDS
 from ..envs.goal_envs import known_id
 from ..settings.fields import check_names, checked, settings_of
@@ -27,6 +30,7 @@ def run_settings(
     given: Mapping[str, Any],
     lift: bool | Literal["auto"],
     seed: int,
+    report: Report,
 ) -> dict[str, Any]:
     """Return every setting of a `FollowObject`; warn of one that a save could not hold.
 
@@ -37,6 +41,7 @@ def run_settings(
         given: settings by their names; of those that are mappings, the names given win.
         lift: the opposite of the setting object_on_table; "auto" leaves it as it is.
         seed: of the run.
+        report: called with a sentence where looking at a task of others may take minutes.
 
     Raises:
         ValueError: a name or a value is not known, out of range or in the wrong place.
@@ -45,8 +50,11 @@ def run_settings(
         given = {**given, "object_on_table": _on_table(lift, given.get("object_on_table"))}
     env_id, before = known_id(full_id), asdict(StageSettings())
     if preset is not None:
-        of_preset = run_config(full_id, method=method, preset=preset, seed=seed)
+        of_preset = run_config(full_id, method=method, preset=preset, seed=seed, report=report)
         before |= of_preset.settings
+    elif env_id not in IDS and given.get("imagine", before["imagine"]):
+        with suppress(ValueError):  # refused where what is found is asked for
+            derived(env_id, report)
     settings = checked(StageSettings, _merged(before, given), _WHO)
     for name, each in settings_of(StageSettings).items():
         if each.group is not None and settings[name] is None and name != "reach":

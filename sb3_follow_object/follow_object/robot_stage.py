@@ -46,14 +46,13 @@ class RobotStage:
         self._settings = settings
         self._seed: int = settings["seed"]
         self.env = self._copies("robot")
-        env_id = settings["env_id"]
-        check_goal_keys(self.env.observation_space, repr(env_id))
-        horizon = episode_steps(self.env)
-        if horizon is None:
-            raise ValueError(f"{env_id!r} does not say how long its episodes are; {SAY_LENGTH}")
-        self.horizon = horizon
-        steps = steps_of_object(env_id, self.horizon)
-        self.curriculum = Curriculum(steps, **settings["curriculum"])
+        try:
+            self.horizon = self._episode_steps()
+            steps = steps_of_object(settings["env_id"], self.horizon)
+            self.curriculum = Curriculum(steps, **settings["curriculum"])
+        except BaseException:
+            self.env.close()  # its processes would outlive the refusal
+            raise
         self.model: HerDDPG | None = None
         self.curriculum_callback: CurriculumCallback | None = None
         self.reach_callback: ReachCallback | None = None
@@ -167,6 +166,19 @@ class RobotStage:
             every=self._settings["test_every"],
             store=self._settings["store_tests"],
         )
+
+    def _episode_steps(self) -> int:
+        """Return T, steps of an episode.
+
+        Raises:
+            ValueError: the environment does not say, or has no goals.
+        """
+        env_id: str = self._settings["env_id"]
+        check_goal_keys(self.env.observation_space, repr(env_id))
+        horizon = episode_steps(self.env)
+        if horizon is None:
+            raise ValueError(f"{env_id!r} does not say how long its episodes are; {SAY_LENGTH}")
+        return horizon
 
     def _copies(self, purpose: str) -> VecEnv:
         """Make copies of the task, whose episodes are of the random stream of this name."""

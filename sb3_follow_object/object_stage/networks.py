@@ -25,9 +25,6 @@ from ..settings.learning import InverseSettings
 FILE = "object_networks.safetensors"
 FORMAT = 1
 OBSERVATION, GOAL, ACTION = 12, 3, 7  # of the object's environment, without a context
-SAY_NO_MIRRORS = (
-    "SLDR's reward reads an object's policy without mirrors; leave them out of object_algorithm"
-)
 
 
 class ObjectNetworks(WholeModule):
@@ -133,14 +130,8 @@ class ObjectNetworks(WholeModule):
         )
         seed = checked_whole("seed", seed)
         policy = model.policy
+        check_readable(policy)
         assert policy.net_arch is not None
-        if policy.activation_fn is not nn.ReLU:
-            raise ValueError(
-                "SLDR's reward reads an object policy with ReLU, not "
-                f"{policy.activation_fn.__name__}; leave activation_fn out of object_algorithm"
-            )
-        if policy.mirrors:
-            raise ValueError(SAY_NO_MIRRORS)
         pi, qf = get_actor_critic_arch(policy.net_arch)
         extractor = model.actor.features_extractor
         assert isinstance(model.observation_space, spaces.Dict)
@@ -274,6 +265,20 @@ class ObjectNetworks(WholeModule):
                     f"{what} were made for {name} {found!r}, not for {wanted!r}; run the object "
                     "stage of that task"
                 )
+
+
+def check_readable(policy: HerPolicy) -> None:
+    """Raise a ValueError for an object's policy that SLDR's reward cannot read."""
+    if policy.activation_fn is not nn.ReLU:
+        raise ValueError(
+            "SLDR's reward reads an object policy with ReLU, not "
+            f"{policy.activation_fn.__name__}; leave activation_fn out of object_algorithm"
+        )
+    if policy.mirrors:
+        raise ValueError(
+            "SLDR's reward reads an object's policy without mirrors; leave them out of "
+            "object_algorithm"
+        )
 
 
 def _dict_space(n_observed: int) -> spaces.Dict:

@@ -21,9 +21,10 @@ from ..any_task.tasks import (
 from ..common.reports import Report
 from ..common.seeds import stream_seed
 from ..ddpg.her_ddpg import HerDDPG
+from ..envs import IDS
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.predictor_files import without_module
-from .networks import ObjectNetworks
+from .networks import ObjectNetworks, check_readable
 from .policy import ObjectProgress, StopWhenSolved, collect_paths, train_object_policy
 
 
@@ -105,7 +106,8 @@ class ObjectStage:
             callback: makes a callback from the one that tests the object's policy.
             state: of that one; stage one goes on exactly from there.
             between_epochs: called while the inverse model is fitted; may raise to stop.
-            networks: whether to make what SLDR needs for others, though this run does not.
+            networks: whether to make what SLDR needs for others, though this run does not, where
+                they can read it.
         """
         model, _ = self._learn(callback, state, between_epochs, False)
         self._make_networks(model, between_epochs, networks)
@@ -116,6 +118,7 @@ class ObjectStage:
         state: dict[str, Any] | None = None,
         between_epochs: Callable[[], None] = lambda: None,
         networks: bool = False,
+        keep: Callable[[GoalPredictor], None] = lambda predictor: None,
     ) -> GoalPredictor:
         """Run both stages: object policy, then F_phi (sections 4.1 and 4.2).
 
@@ -124,9 +127,11 @@ class ObjectStage:
             state: as in `learn_policy`.
             between_epochs: called while F_phi and the inverse model are fitted; may raise to stop.
             networks: as in `learn_policy`.
+            keep: called with F_phi, before SLDR's networks are made.
         """
         model, self.predictor = self._learn(callback, state, between_epochs, True)
         assert self.predictor is not None
+        keep(self.predictor)
         self._make_networks(model, between_epochs, networks)
         return self.predictor
 
@@ -210,9 +215,15 @@ class ObjectStage:
     def _make_networks(
         self, model: HerDDPG, between_epochs: Callable[[], None], asked: bool
     ) -> None:
-        """Make what SLDR's reward reads, where it will be read."""
-        if not (asked or self.needs_networks):
-            return
+        """Make what SLDR's reward reads, where it will be read; if others ask, where it can be."""
+        if not self.needs_networks:
+            if not asked or self.env_id not in IDS:
+                return
+            try:
+                check_readable(model.policy)
+            except ValueError as refusal:
+                self.report(f"  the object's networks are left out: {refusal}")
+                return
         self.networks = ObjectNetworks.learned(
             model,
             self.env_id,

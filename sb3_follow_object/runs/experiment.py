@@ -91,8 +91,7 @@ def train(
         checkpoints = Checkpoints(folder, config.keep_checkpoints, report)
         stack.callback(checkpoints.wait)
         stages = RunStages(config, folder, run, checkpoints, stop)
-        if resume:
-            stages.load_newest_checkpoint()
+        stages.load_newest_checkpoint()
         wall_before = stages.load_object_stage()
         try:
             if wall_before is None:

@@ -6,12 +6,15 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
+from ..any_task.derived import derived
 from ..any_task.tasks import kept_as, physics_of_task, surface_choices
 from ..common.cache import CACHE_VARIABLE as CACHE_VARIABLE
 from ..common.cache import SET_THE_VARIABLE, cache_folder
 from ..common.files import lock
 from ..common.reports import Report
+from ..envs import IDS
 from ..envs.registration import import_task
+from ..follow_object.checks import check_object_stage
 from ..follow_object.follow_object import FollowObject
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.predictor_files import FACTS_FILE
@@ -49,6 +52,8 @@ def get_predictor(
             be written; or the task's object cannot be followed.
     """
     env_id = import_task(env_id)
+    if env_id not in IDS:
+        derived(env_id, report)
     path = _kept(FACTS_FILE, env_id, folder, report)
     choices = surface_choices(env_id)
     on_table = choices[0] if len(choices) == 1 else None  # else the object's learning has decided
@@ -75,9 +80,14 @@ def get_object_networks(
     """Return what SLDR needs of a task's object stage; kept beside F_phi, see `get_predictor`.
 
     Raises:
-        ValueError: as `get_predictor`; or the folder holds F_phi alone, which is not replaced.
+        ValueError: as `get_predictor`; the folder holds F_phi alone, which is not replaced; or the
+            task is not one of this package, whose networks alone SLDR can read.
     """
     env_id = import_task(env_id)
+    if env_id not in IDS:
+        raise ValueError(
+            f"{env_id!r} is not a task of this package; SLDR reads an object's networks in no other"
+        )
     path = _kept(OBJECT_FILE, env_id, folder, report)
     return ObjectNetworks.load(path, env_id=env_id, physics=physics_of_task(env_id))
 
@@ -110,7 +120,17 @@ def _kept(name: str, env_id: str, folder: str | os.PathLike[str] | None, report:
 def learn_predictor(
     config: RunConfig, folder: str | os.PathLike[str], report: Report = print
 ) -> GoalPredictor:
-    """Run stages one and two (paper, sections 4.1 and 4.2) and save what a folder lacks of both."""
+    """Run stages one and two (paper, sections 4.1 and 4.2) and save what a folder lacks of both.
+
+    Raises:
+        ValueError: the object's algorithm cannot be built with these settings.
+    """
+    folder = Path(folder)
+
+    def keep(predictor: GoalPredictor) -> None:
+        if not (folder / FACTS_FILE).exists():  # others may be reading it
+            predictor.save(folder)
+
     run = FollowObject(
         config.env_id,
         preset=None,
@@ -119,12 +139,11 @@ def learn_predictor(
         **{**config.settings, "n_envs": 1},
     )
     try:
-        predictor = run.object_stage.learn_predictor(networks=True)
+        check_object_stage(run.settings, run.horizon, needs_networks=False)
+        predictor = run.object_stage.learn_predictor(networks=True, keep=keep)
     finally:
         run.close()
-    assert run.object_stage.networks is not None
-    if not (Path(folder) / FACTS_FILE).exists():  # others may be reading it
-        predictor.save(folder)
-    if not (Path(folder) / OBJECT_FILE).exists():
-        run.object_stage.networks.save(Path(folder) / OBJECT_FILE)
+    networks = run.object_stage.networks
+    if networks is not None and not (folder / OBJECT_FILE).exists():
+        networks.save(folder / OBJECT_FILE)
     return predictor

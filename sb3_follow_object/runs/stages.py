@@ -5,12 +5,14 @@ from __future__ import annotations
 import gc
 import json
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.vec_env import VecEnv
 
 from ..callbacks.eval_callback import OriginalGoalEvalCallback
 from ..common.files import atomic_write
@@ -115,14 +117,23 @@ class RunStages:
 
     def learn_robot_stage(self, wall_before: float, progress: Progress) -> float:
         """Run what is left of the robot's stage; return the seconds that all stages took."""
+        model = self._prepare_robot()
+        n_threads = self.run.settings["n_threads"]
+        with closing(evaluation_env(self.config.env_id, n_threads=n_threads)) as copies:
+            evaluation = self._train(model, copies, wall_before, progress)
+        return evaluation.wall_s
+
+    def _train(
+        self, model: HerDDPG, copies: VecEnv, wall_before: float, progress: Progress
+    ) -> OriginalGoalEvalCallback:
+        """Train the robot, validated in these copies of its task; return what validated it."""
         saved = self._take_checkpoint()
         if saved is not None and saved["stage"] != "robot":
             saved = None
         if saved is None:  # what was evaluated after the last checkpoint begins anew
             (self.folder / EVALUATIONS).unlink(missing_ok=True)
 
-        model = self._prepare_robot()
-        evaluation = self._validation(wall_before)
+        evaluation = self._validation(copies, wall_before)
         keeper = RunCallback(
             self.run,
             evaluation,
@@ -167,8 +178,7 @@ class RunStages:
                 f"solved after {self.run.env_steps} env steps of {total}: "
                 f"{keeper.solved_validations} validations in a row of {keeper.solved_at:g} or more"
             )
-        evaluation.eval_env.close()
-        return evaluation.wall_s
+        return evaluation
 
     def _prepare_robot(self) -> HerDDPG:
         """Return the robot's algorithm, on the threads and the device that the run is given."""
@@ -181,10 +191,10 @@ class RunStages:
             self.run.report(Trouble(sentence))
         return model
 
-    def _validation(self, wall_before: float) -> OriginalGoalEvalCallback:
+    def _validation(self, copies: VecEnv, wall_before: float) -> OriginalGoalEvalCallback:
         """Return what tests the robot while it learns, and keeps the curve."""
         return OriginalGoalEvalCallback(
-            evaluation_env(self.config.env_id, n_threads=self.run.settings["n_threads"]),
+            copies,
             self.config.n_eval_episodes,
             self.config.eval_every,
             csv_path=self.folder / EVALUATIONS,

@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from ..any_task.derived import derived
 from ..any_task.tasks import (
-    check_followable,
     registered_horizon,
     steps_of_object,
     success_distance_of,
@@ -18,6 +18,7 @@ from ..any_task.tasks import (
 )
 from ..common.numbers import as_number, shown
 from ..common.plain_yaml import load_yaml
+from ..common.reports import Report
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, object_id
 from ..envs.goal_envs import check_task
@@ -88,6 +89,7 @@ def run_config(
     file: str | os.PathLike[str] | None = None,
     seed: int = 0,
     overrides: Mapping[str, Any] | None = None,
+    report: Report = lambda sentence: None,
 ) -> RunConfig:
     """Read a task's settings and return the configuration of a run.
 
@@ -99,6 +101,7 @@ def run_config(
         file: YAML in rl_zoo3's layout, in place of a preset.
         seed: of the run.
         overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win.
+        report: called with a sentence where looking at a task of others may take minutes.
 
     Raises:
         ValueError: an invalid id, file, key or value, with the nearest valid one.
@@ -114,7 +117,7 @@ def run_config(
         path = Path(file)
     known = ZooFile(path)
     imagine = known.imagines(env_id)
-    settings = _task_settings(known, env_id, imagine)
+    settings = _task_settings(known, env_id, imagine, report)
     ours = file is None and preset == "default"  # the paper's cycles are the paper's
     if ours and _is_unknown(known, env_id):
         _fit_to_horizon(settings, env_id)
@@ -168,7 +171,7 @@ def _is_unknown(known: ZooFile, env_id: str) -> bool:
     return env_id not in IDS and not known.names(env_id)
 
 
-def _task_settings(known: ZooFile, env_id: str, imagine: bool) -> dict[str, Any]:
+def _task_settings(known: ZooFile, env_id: str, imagine: bool, report: Report) -> dict[str, Any]:
     """Return what a file says of a task, its object's stage included, as fits the task."""
     settings = known.settings(env_id)
     needs_networks = _auxiliary_name(settings) == "sldr"
@@ -181,7 +184,7 @@ def _task_settings(known: ZooFile, env_id: str, imagine: bool) -> dict[str, Any]
             f"{env_id!r} is not a task of this package, whose observations alone SLDR's reward "
             "can read the object's state from; train it with --method fo or her"
         )
-    check_followable(env_id)
+    derived(env_id, report)  # refused here if its object cannot be followed
     if _is_unknown(known, env_id):  # set up as the package's most similar task
         if surface_choices(env_id)[0]:
             settings = known.settings(SIMILAR[True])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ..any_task.tasks import steps_of_object
 from ..common.numbers import checked_whole
 from ..envs import IDS
 from .fields import settings_of
@@ -56,18 +57,19 @@ def check_stages(env_id: str, given: Mapping[str, Any], horizon: int | None) -> 
         env_id: the task. What an episode's end decides is told of this package's own alone, whose
             episodes all have the same length.
         given: settings of `FollowObject`.
-        horizon: T, steps of an episode; None where that is not known.
+        horizon: T, steps of the robot's episodes; None where that is not known.
     """
     settings = {**_defaults(StageSettings), **given}
     whole = env_id in IDS
+    of_object = None if horizon is None else steps_of_object(env_id, horizon)
     _check_algorithm(settings["algorithm"], settings["n_envs"], horizon, whole, "")
     if _has_object_stage(settings):
         where, n_envs = "object_algorithm: ", settings["object_n_envs"]
-        _check_algorithm(settings["object_algorithm"], n_envs, horizon, whole, where)
+        _check_algorithm(settings["object_algorithm"], n_envs, of_object, whole, where)
         _check_object(settings["object_algorithm"] or {}, settings["object_timesteps"])
     if settings["imagine"]:
         curriculum = {**_defaults(CurriculumSettings), **(settings["curriculum"] or {})}
-        levels = horizon if curriculum["levels"] == "time" else curriculum["n_levels"]
+        levels = of_object if curriculum["levels"] == "time" else curriculum["n_levels"]
         checked_whole("curriculum: k_max", curriculum["k_max"], 1, levels)
 
 

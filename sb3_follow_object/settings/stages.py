@@ -186,7 +186,7 @@ class StageSettings(Group):
         Whole, setting("copies of the object's environment", ge=1, le=COPIES)
     ] = 16
     object_timesteps: Annotated[
-        Whole, setting("env steps after which the object's stage gives up", ge=1)
+        Whole, setting("env steps after which a trial of the object's policy gives up", ge=1)
     ] = 400_000
     object_test_every: Annotated[
         Whole, setting("rollouts of every copy between two tests of the object", ge=1)

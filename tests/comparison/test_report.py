@@ -132,6 +132,14 @@ def test_command_writes_beside_the_run(tmp_path: Path, capsys: pytest.CaptureFix
     assert (run / "report.html").exists()
 
 
+@pytest.mark.parametrize("text", ["{", "3", "null"])
+def test_damaged_versions_are_named(text: str, tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    (run / "versions.json").write_text(text)
+    with pytest.raises(ValueError, match=r"versions.json does not say what the run was made with"):
+        write_run_report(run, tmp_path / "report.html", {})
+
+
 def test_command_refuses_in_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["report", str(tmp_path)]) == 2
     assert "holds no runs" in capsys.readouterr().err

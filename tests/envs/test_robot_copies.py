@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import subprocess
 import sys
+import threading
+import time
 from functools import partial
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,7 @@ import pytest
 import toy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_follow_object.envs import copies_worker, robot_copies
 from sb3_follow_object.envs.robot_copies import (
     ProcessVecEnv,
     robot_maker,
@@ -194,6 +199,88 @@ def test_a_process_that_has_ended_is_one_sentence_whenever_it_is_asked() -> None
             env.step(np.zeros((4, 3), np.float32))
     assert env.get_attr("steps", 0) == [2], "its neighbour answers what it is asked"
     env.close()
+
+
+def test_a_fork_of_this_process_does_not_keep_the_processes_alive() -> None:
+    env = ProcessVecEnv(Counts, 4, 2)
+    env.reset()
+    fork = os.fork()  # which has this process's end of every line
+    if fork == 0:
+        time.sleep(60.0)
+        os._exit(0)
+    try:
+        started = time.monotonic()
+        env.close()
+        assert time.monotonic() - started < robot_copies._CLOSING_S / 2
+        assert [worker._process.poll() for worker in env._workers] == [0, 0]
+    finally:
+        os.kill(fork, signal.SIGKILL)
+        os.waitpid(fork, 0)
+
+
+class Stuck(toy.PointEnv):
+    """Takes a minute to close, but in the process that judges."""
+
+    def __init__(self, judge: int) -> None:
+        super().__init__()
+        self.judge = judge
+
+    def close(self) -> None:
+        if os.getpid() != self.judge:
+            time.sleep(60.0)
+
+
+def test_a_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robot_copies, "_CLOSING_S", 0.2)
+    env = ProcessVecEnv(partial(Stuck, os.getpid()), 2, 1)
+    env.reset()
+    env.close()
+    assert env._workers[0]._process.poll() == -signal.SIGKILL
+
+
+def test_what_cannot_be_sent_is_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
+    held = threading.Lock()
+
+    def make() -> gym.Env:
+        with held:
+            return toy.PointEnv()
+
+    with pytest.raises(ValueError) as refusal:
+        ProcessVecEnv(make, 4, 2)
+    assert str(refusal.value) == (
+        "the environment cannot be sent to processes (TypeError: cannot pickle '_thread.lock' "
+        "object); take n_threads=1"
+    )
+    assert capfd.readouterr() == ("", ""), "no process has begun"
+
+
+def test_a_process_that_nobody_tells_what_to_make_ends_quietly() -> None:
+    ours, theirs = Pipe()
+    ours.close()
+    copies_worker.serve(theirs)
+
+
+class OfOneProcess(toy.PointEnv):
+    """Can be made in the process that judges alone."""
+
+    def __init__(self, judge: int) -> None:
+        super().__init__()
+        if os.getpid() != judge:
+            raise LookupError("only one may be open")
+
+
+def test_processes_end_where_one_cannot_make_its_copies(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[Any] = []
+    begin = robot_copies._Worker.__init__
+
+    def noting(worker: Any, *arguments: Any) -> None:
+        begin(worker, *arguments)
+        begun.append(worker)
+
+    monkeypatch.setattr(robot_copies._Worker, "__init__", noting)
+    with pytest.raises(LookupError, match="only one may be open"):
+        ProcessVecEnv(partial(OfOneProcess, os.getpid()), 4, 2)
+    assert [worker._process.poll() is None for worker in begun] == [False, False]
 
 
 _OF_A_SCRIPT = """

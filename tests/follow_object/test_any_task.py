@@ -20,6 +20,7 @@ from sb3_follow_object.any_task import derived as looking
 from sb3_follow_object.any_task import registering
 from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.common.cache import CACHE_VARIABLE
+from sb3_follow_object.envs import robot_copies
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.follow_object.saved_folder import read
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
@@ -32,6 +33,8 @@ from sb3_follow_object.runs import predictor_cache
 from sb3_follow_object.settings.presets import run_config
 
 ARM = arm_and_wall.ARM
+LONGER = "Longer-v0"
+gym.register(LONGER, arm_and_wall.ArmAndWall, max_episode_steps=150)
 
 
 @pytest.fixture(autouse=True)
@@ -239,6 +242,17 @@ def test_a_folders_predictor_may_be_of_paths_of_ones_own(tmp_path: Path) -> None
     assert env.predictor.physics == "a line"
 
 
+def test_paths_of_ones_own_may_be_as_long_as_the_robots_episodes(tmp_path: Path) -> None:
+    path = np.linspace([0.3, -0.2, 0.025], [0.4, 0.2, 0.025], 151)
+    paths = np.tile(path, (20, 1, 1))
+    predictor = GoalPredictor.fit(paths, paths[:, -1], env_id=LONGER, physics="a line", epochs=1)
+    predictor.save(tmp_path / "phi")
+    for given in (predictor, tmp_path / "phi"):
+        env = ImaginedGoalWrapper(gym.make(LONGER), given, {"p": 0.0})
+        assert env.predictor.horizon == env.curriculum.horizon == 150
+    assert ImaginedGoalWrapper(gym.make(LONGER), tmp_path / "none").curriculum.horizon == 50
+
+
 def test_a_wall_that_stands_elsewhere_in_each_episode_is_seen_in_all_stages(tmp_path: Path) -> None:
     replay = {"replay_buffer_kwargs": {"imagined_ratio": 0.5}}
     settings = {**TINY, "n_envs": 4, "n_threads": 2, "algorithm": {**SMALL_NET, **replay}}
@@ -284,7 +298,6 @@ def test_an_id_has_one_predictor_with_a_module_before_it_and_without(
     predictor = predictor_cache.get_predictor(full_id, report=quiet)
     env = ImaginedGoalWrapper(gym.make(full_id), curriculum={"p": 0.0})
     np.testing.assert_array_equal(env.predictor.error_mm, predictor.error_mm)
-    assert predictor_cache.get_object_networks(full_id, report=quiet).env_id == ARM
     assert learned == [ARM]
     found = (tmp_path / "cache").rglob(FACTS_FILE)
     assert list(found) == [tmp_path / "cache" / ARM / kept_as(ARM) / FACTS_FILE]
@@ -292,6 +305,50 @@ def test_an_id_has_one_predictor_with_a_module_before_it_and_without(
         assert bare_run(env_id, predictor=predictor, **TINY).predictor is predictor
     with pytest.raises(ValueError, match=f"was made for {ARM} .* not for {moving_wall.WALL} "):
         bare_run(f"moving_wall:{moving_wall.WALL}", predictor=predictor, **TINY)
+
+
+def test_networks_that_nothing_reads_are_not_made() -> None:
+    stage = bare_run(ARM, **TINY).object_stage
+    stage.learn_predictor(networks=True)
+    assert stage.predictor is not None and stage.networks is None
+
+
+@pytest.mark.parametrize("preset", ["default", None])
+def test_whoever_waits_for_resets_is_told_so_once(preset: str | None) -> None:
+    said: list[str] = []
+    for _ in range(2):
+        FollowObject(ARM, preset=preset, report=said.append, n_envs=1)
+    assert said == [f"where 60 episodes of {ARM} begin is recorded, once"]
+
+
+def test_settings_and_predictors_say_that_resets_are_recorded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said: list[str] = []
+    run_config(ARM, method="her", report=said.append)
+    assert said == [], "whose object is not followed"
+    run_config(ARM, report=said.append)
+    assert said == [f"where 60 episodes of {ARM} begin is recorded, once"]
+    said.clear()
+    monkeypatch.setattr(predictor_cache, "learn_predictor", lambda *_: None)
+    with pytest.raises(ValueError, match=FACTS_FILE):
+        predictor_cache.get_predictor(moving_wall.WALL, report=said.append)
+    assert said == [f"where 60 episodes of {moving_wall.WALL} begin is recorded, once"]
+
+
+def test_a_refused_curriculum_leaves_no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[Any] = []
+    begin = robot_copies._Worker.__init__
+
+    def noting(worker: Any, *arguments: Any) -> None:
+        begin(worker, *arguments)
+        begun.append(worker._process)
+
+    monkeypatch.setattr(robot_copies._Worker, "__init__", noting)
+    settings = {**TINY, "n_envs": 4, "n_threads": 2, "curriculum": {"k_max": 60}}
+    with pytest.raises(ValueError, match="k_max is 60"):
+        bare_run(ARM, **settings)
+    assert [process.poll() for process in begun] == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -336,21 +393,18 @@ def test_presets_set_a_task_up_as_the_packages_most_similar_one() -> None:
     assert given["curriculum"]["min_distance"] == 0.5
 
 
-gym.register("Longer-v0", arm_and_wall.ArmAndWall, max_episode_steps=150)
-
-
 @pytest.mark.parametrize("method", ["fo", "her"])
 def test_longer_episodes_have_as_many_updates_and_tests_an_env_step(method: str) -> None:
-    runs = [run_config(task, method=method) for task in (ARM, "Longer-v0")]
+    runs = [run_config(task, method=method) for task in (ARM, LONGER)]
     assert [each.eval_every for each in runs] == [20_000, 60_000]
     usual, longer = (each.settings for each in runs)
     updates = [each["algorithm"]["gradient_steps"] for each in (usual, longer)]
     assert updates[1] == 3 * updates[0]
     if method == "fo":
         assert (usual["test_every"], longer["test_every"]) == (4, 1)
-    paper = [run_config(task, method=method, preset="paper") for task in (ARM, "Longer-v0")]
+    paper = [run_config(task, method=method, preset="paper") for task in (ARM, LONGER)]
     assert paper[0].settings["algorithm"] == paper[1].settings["algorithm"]
-    given = run_config("Longer-v0", method=method, overrides={"gradient_steps": 7})
+    given = run_config(LONGER, method=method, overrides={"gradient_steps": 7})
     assert given.settings["algorithm"]["gradient_steps"] == 7
 
 

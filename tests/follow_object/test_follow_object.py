@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.evaluation import evaluate_policy
 from tiny_runs import bare_run
 
 from sb3_follow_object.common.seeds import stream_seed
@@ -68,6 +69,10 @@ def test_learn_counts_every_step(predictor: GoalPredictor) -> None:
     assert run.env_steps == run.model.num_timesteps
     obs = run.env.reset()
     assert run.predict(obs)[0].shape == (2, 4)  # type: ignore[arg-type]
+    start = np.ones(2, dtype=bool)
+    assert run.predict(obs, None, start, True)[1] is None  # type: ignore[arg-type]
+    mean_return, _ = evaluate_policy(run, run.env, n_eval_episodes=2, warn=False)  # type: ignore[arg-type]
+    assert -run.horizon <= mean_return <= 0  # type: ignore[operator]
 
 
 def test_same_seed_same_weights(predictor: GoalPredictor) -> None:
@@ -418,6 +423,13 @@ def test_a_save_is_loaded_for_its_own_environment(
         ({"predictor_fit": {"test_share": 2.0}}, "test_share is 2.0; it must lie in"),
         ({"n_test_episodes": 0}, "n_test_episodes is 0"),
         ({"n_paths": 1}, "n_paths is 1"),
+        (
+            {
+                "reward_type": "dense",
+                "algorithm": {"replay_buffer_kwargs": {"goal_margin": 0.3}},
+            },
+            "goal_margin is for environments that pay by whether a goal is near enough",
+        ),
     ],
 )
 def test_wrong_settings_are_refused_before_the_object_learns(

@@ -322,6 +322,22 @@ def test_run_needs_the_networks_of_its_object_stage() -> None:
     run.close()
 
 
+def test_an_object_with_other_activations_is_refused_before_it_learns() -> None:
+    of_object = {**SMALL, "policy_kwargs": {"net_arch": [8], "activation_fn": th.nn.Tanh}}
+    del of_object["seed"]
+    with pytest.warns(UserWarning, match="activation_fn"):
+        run = bare_run(
+            TASK,
+            algorithm={"auxiliary": {"name": "sldr"}},
+            object_algorithm=of_object,
+            imagine=False,
+            n_envs=1,
+        )
+    with pytest.raises(ValueError, match="reads an object policy with ReLU, not Tanh"):
+        run.check()
+    run.close()
+
+
 def damage(tree: dict[str, Any], what: str) -> None:
     if what == "format":
         tree["format"] = 99

@@ -27,6 +27,7 @@ from sb3_follow_object.common.array_trees import load_tree
 from sb3_follow_object.common.files import lock
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import make_vec
+from sb3_follow_object.follow_object.robot_stage import RobotStage
 from sb3_follow_object.object_stage.policy import collect_paths
 from sb3_follow_object.runs import evaluation, stages
 from sb3_follow_object.runs.checkpoints import checkpoint_files
@@ -262,6 +263,26 @@ def test_the_final_test_does_not_keep_the_validations_copies(
     monkeypatch.setattr(stages, "evaluate", counting)
     train(config("Counted-v0"), tmp_path / "run", report=runs.quiet)
     assert alive[0] < 2 + evaluation._COPIES, "the training's and none of the validation's"
+
+
+def test_an_interrupted_run_closes_the_validations_copies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = []
+
+    def interrupt(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    def noting(*arguments: Any, **options: Any) -> Any:
+        env = evaluation.evaluation_env(*arguments, **options)
+        monkeypatch.setattr(env, "close", lambda: closed.append(env))
+        return env
+
+    monkeypatch.setattr(stages, "evaluation_env", noting)
+    monkeypatch.setattr(RobotStage, "learn", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        train(config("Counted-v0"), tmp_path / "run", report=runs.quiet)
+    assert len(closed) == 1
 
 
 def test_a_relative_folder_is_the_one_of_the_start(

@@ -11,12 +11,15 @@ from typing import Any
 
 import pytest
 from read_only import read_only_copy
-from tiny import TASK, cache_networks, cache_predictor, tiny_networks
+from tiny import HORIZON, TASK, cache_networks, cache_predictor, tiny_networks
+from tiny_runs import SMALL_NET, config, quiet
 
 from sb3_follow_object.common.files import lock
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.imagination.predictor_files import FACTS_FILE
 from sb3_follow_object.object_stage.networks import FILE as OBJECT_FILE
+from sb3_follow_object.object_stage.networks import ObjectNetworks
+from sb3_follow_object.object_stage.stage import ObjectStage
 from sb3_follow_object.runs import predictor_cache
 from sb3_follow_object.runs.predictor_cache import (
     CACHE_VARIABLE,
@@ -24,7 +27,9 @@ from sb3_follow_object.runs.predictor_cache import (
     get_object_networks,
     get_predictor,
     kept_predictor,
+    learn_predictor,
 )
+from sb3_follow_object.settings.run_config import RunConfig
 
 
 @pytest.fixture
@@ -114,22 +119,66 @@ def test_learning_what_is_missing_leaves_what_others_may_be_reading(
     class Stage:
         networks = tiny_networks()
 
-        def learn_predictor(self, networks: bool) -> GoalPredictor:
-            return GoalPredictor.load(folder)
+        def learn_predictor(self, networks: bool, keep: Any) -> GoalPredictor:
+            predictor = GoalPredictor.load(folder)
+            keep(predictor)
+            return predictor
 
     class Run:
         def __init__(self, *arguments: Any, **settings: Any) -> None:
             self.object_stage = Stage()
+            self.settings, self.horizon = settings, HORIZON
 
         def close(self) -> None:
             pass
 
     monkeypatch.setattr(predictor_cache, "FollowObject", Run)
+    monkeypatch.setattr(predictor_cache, "check_object_stage", lambda *_, **options: None)
     monkeypatch.setattr(GoalPredictor, "save", lambda *arguments: pytest.fail("written over"))
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     assert get_object_networks(TASK).env_id == TASK
     assert (folder / OBJECT_FILE).exists()
     assert {name: (folder / name).read_bytes() for name in kept} == kept
+
+
+def folding(mirror: dict[str, Any]) -> RunConfig:
+    """A tiny run whose object's policy has a mirror."""
+    algorithm = {**SMALL_NET, "policy_kwargs": {"net_arch": [8], "mirrors": [mirror]}}
+    return config(settings={"object_algorithm": algorithm})
+
+
+def test_an_object_that_sldr_cannot_read_has_f_phi_alone(tmp_path: Path) -> None:
+    said: list[str] = []
+    learn_predictor(folding({"axis": 0, "at": 1.3}), tmp_path, said.append)
+    assert GoalPredictor.load(tmp_path).env_id == TASK
+    assert not (tmp_path / OBJECT_FILE).exists()
+    assert "object's networks are left out: SLDR's reward reads an object's policy" in said[-1]
+
+
+def test_f_phi_is_kept_before_the_networks_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: Any, **settings: Any) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(ObjectNetworks, "learned", fail)
+    with pytest.raises(MemoryError):
+        learn_predictor(config(), tmp_path, quiet)
+    assert GoalPredictor.load(tmp_path).env_id == TASK
+
+
+def test_an_object_that_cannot_be_trained_is_refused_before_it_learns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ObjectStage, "learn_predictor", lambda *_, **options: pytest.fail("learns"))
+    with pytest.raises(ValueError, match="mirror"):
+        learn_predictor(folding({"axis": 0, "at": 1.3, "actions": [99]}), tmp_path, quiet)
+
+
+@pytest.mark.usefixtures("never_learned")
+def test_networks_are_of_this_packages_tasks_alone() -> None:
+    with pytest.raises(ValueError, match="'FetchPush-v4' is not a task of this package; SLDR"):
+        get_object_networks("FetchPush-v4")
 
 
 @pytest.mark.parametrize(

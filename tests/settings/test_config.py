@@ -25,6 +25,7 @@ from sb3_follow_object.settings.presets import (
     run_config,
 )
 from sb3_follow_object.settings.run_config import RunConfig
+from sb3_follow_object.settings.sizes import check_stages
 from sb3_follow_object.settings.zoo_yaml import (
     CALLBACK,
     OF_RUNS,
@@ -399,6 +400,16 @@ def test_damaged_configuration_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match="is not the configuration of a run"):
         load_config(tmp_path)
+
+
+def test_an_object_whose_episodes_are_shorter_is_measured_by_its_own() -> None:
+    of_object = {"buffer_size": 1600, "batch_size": 16, "learning_starts": 100}
+    given: dict[str, Any] = {"algorithm": None, "object_algorithm": of_object}
+    check_stages("Somebodys-v0", {**given, "object_n_envs": 16}, 500)
+    with pytest.raises(ValueError, match=r"^object_algorithm: buffer_size .* than the 50 of an"):
+        check_stages("Somebodys-v0", {**given, "object_n_envs": 40}, 500)
+    with pytest.raises(ValueError, match=r"curriculum: k_max is 200; it must be at most 50"):
+        check_stages("Somebodys-v0", {**given, "curriculum": {"k_max": 200}}, 500)
 
 
 def test_each_ablation_of_the_docs_changes_one_setting() -> None:

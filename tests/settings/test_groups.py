@@ -318,7 +318,7 @@ def test_a_reward_has_its_own_settings_alone() -> None:
 def test_distances_are_fitted_to_a_task_of_others_where_they_are_some(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: Any, outcome: Any
 ) -> None:
-    monkeypatch.setattr(presets, "check_followable", lambda env_id: None)
+    monkeypatch.setattr(presets, "derived", lambda env_id, report: None)
     monkeypatch.setattr(presets, "surface_choices", lambda env_id: (False,))
     monkeypatch.setattr(presets, "success_distance_of", lambda env_id: SUCCESS_DISTANCE / 2)
     entry = {"env_wrapper": WRAPPER, "replay_buffer_kwargs": {"moved_distance": given}}
