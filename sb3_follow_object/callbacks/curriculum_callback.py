@@ -37,6 +37,8 @@ class CurriculumCallback(CopyableCallback):
     training that goes on from a loaded model goes on at its k_max. A model that has not trained
     begins at the curriculum's first one, whatever another has come to in these wrappers.
 
+    The training's environment goes on to imagine goals after training: evaluate in another.
+
     Args:
         test_env: ImaginedGoalVecEnv with mode="test", or wrappers around one, sharing the
             training's curriculum, and not in VecNormalize: a model that was trained in one

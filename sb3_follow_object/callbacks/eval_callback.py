@@ -14,16 +14,20 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wra
 from ..common.files import atomic_write
 from ..common.numbers import checked_number, checked_whole
 from ..common.seeds import stream_seed
+from ..imagination.vec_env import curriculum_of
 from .copyable import CopyableCallback
 from .curriculum_callback import CurriculumCallback
 from .rollout import check_hears_rollouts, noise_free, run_episodes
+
+_RECORDED = "eval/success_rate"
 
 
 class OriginalGoalEvalCallback(CopyableCallback):
     """Evaluate the policy without noise on fresh episodes with original goals.
 
     Runs at the first end of a rollout after each ``every_steps`` environment steps. Records
-    eval/success_rate, eval/mean_return and eval/env_steps, and appends a row to a CSV file.
+    eval/success_rate, eval/mean_return and eval/env_steps, and appends a row to a CSV file. What
+    is recorded is written to the logger's outputs before the next rollout at the latest.
 
     Args:
         eval_env: vectorised environment that shows the original goals, so without
@@ -38,6 +42,7 @@ class OriginalGoalEvalCallback(CopyableCallback):
         wall_before: seconds that the object stage took, counted in wall_s.
         seed: of the evaluations' episodes, so that a resumed run is tested on the same; None
             leaves the environment's own generators running.
+        verbose: 1 or more prints a line an evaluation.
 
     Attributes:
         success_rate: of the last evaluation, None before the first.
@@ -81,7 +86,7 @@ class OriginalGoalEvalCallback(CopyableCallback):
             raise ValueError(
                 "eval_env is in VecNormalize; the model's own normalises already: leave it out."
             )
-        if eval_env.has_attr("curriculum"):
+        if curriculum_of(eval_env) is not None:
             raise ValueError(
                 "eval_env imagines goals; an evaluation shows the original ones: make one without "
                 "ImaginedGoalVecEnv and ImaginedGoalWrapper."
@@ -149,6 +154,7 @@ class OriginalGoalEvalCallback(CopyableCallback):
         )
 
     def _on_training_end(self) -> None:
+        self._dump()
         self._wall_before, self._started = self.wall_s, None
         self._resumed = False  # what `learn` begins next may count anew
 
@@ -164,6 +170,15 @@ class OriginalGoalEvalCallback(CopyableCallback):
     def _on_step(self) -> bool:
         return True
 
+    def _on_rollout_start(self) -> None:
+        self._dump()
+
+    def _dump(self) -> None:
+        """Write what an evaluation recorded, unless another has since, as a run's folder does."""
+        if self._started is not None and _RECORDED in self.logger.name_to_value:
+            self.logger.record("time/total_timesteps", self._last_steps, exclude="tensorboard")
+            self.logger.dump(self._last_steps)
+
     def _on_rollout_end(self) -> None:
         num_timesteps = self.model.num_timesteps
         if num_timesteps - self._last_steps < self.every_steps:
@@ -175,7 +190,12 @@ class OriginalGoalEvalCallback(CopyableCallback):
         episodes = run_episodes(noise_free(self.model), self.eval_env, self.n_episodes)
         self.success_rate = episodes.success_rate
         mean_return = float(episodes.returns.mean())
-        self.logger.record("eval/success_rate", self.success_rate)
+        if self.verbose >= 1:
+            print(
+                f"evaluation after {num_timesteps} steps: success rate {self.success_rate:.2f}, "
+                f"mean return {mean_return:.2f}"
+            )
+        self.logger.record(_RECORDED, self.success_rate)
         self.logger.record("eval/mean_return", mean_return)
         self.logger.record("eval/env_steps", self.env_steps)
         if self.csv_path is None:
@@ -204,6 +224,11 @@ class OriginalGoalEvalCallback(CopyableCallback):
             rows = list(reader)
         if tuple(reader.fieldnames or ()) != self.COLUMNS:
             raise ValueError(f"{path} exists and is not a file of evaluations.")
+        if rows and self._rows and not self._last_steps:
+            raise ValueError(
+                f"{path} holds this callback's earlier evaluations, and `learn` counts anew: pass "
+                "reset_num_timesteps=False, or make another callback with another file."
+            )
         if rows and not (self._resumed or self._last_steps):
             raise ValueError(
                 f"{path} holds another run's evaluations: give another file, or load the state "

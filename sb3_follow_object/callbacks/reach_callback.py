@@ -31,6 +31,7 @@ class ReachCallback(CopyableCallback):
 
     Args:
         seed: of the reach policy; None draws one from NumPy's global stream, which SB3 seeds.
+        verbose: as of any callback of SB3; it has nothing to print.
         settings: of `ReachTeachingSettings`.
 
     Attributes:
@@ -44,8 +45,8 @@ class ReachCallback(CopyableCallback):
             FollowObjectReplayBuffer.
     """
 
-    def __init__(self, seed: int | None = None, **settings: Any) -> None:
-        super().__init__()
+    def __init__(self, seed: int | None = None, verbose: int = 0, **settings: Any) -> None:
+        super().__init__(verbose)
         given = part_of_reach(ReachTeachingSettings, settings, type(self).__name__)
         self.settings = ReachTeachingSettings(**given)
         self.seed = seed

@@ -130,14 +130,23 @@ def noise_free(model: BaseAlgorithm, learning: bool = False) -> Policy:
     """Return the model's deterministic policy on observations as the environments give them.
 
     Args:
-        model: any algorithm of SB3.
+        model: any algorithm of SB3 whose policy needs to remember nothing.
         learning: of a HerDDPG that averages its actor, the actor that learns instead.
+
+    Raises:
+        ValueError: by the policy returned, if the model's is recurrent.
     """
     player = model.actor if learning and isinstance(model, HerDDPG) else model
     normaliser = model.get_vec_normalize_env()
 
     def policy(obs: Observation) -> np.ndarray:
         seen = obs if normaliser is None else normaliser.normalize_obs(obs)
-        return player.predict(seen, deterministic=True)[0]
+        actions, memory = player.predict(seen, deterministic=True)
+        if memory is not None:
+            raise ValueError(
+                f"the policy of this {type(model).__name__} is recurrent, and here each step would "
+                "begin with an empty memory; play it by SB3's evaluate_policy"
+            )
+        return actions
 
     return policy

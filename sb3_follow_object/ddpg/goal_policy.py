@@ -51,7 +51,9 @@ class GoalPolicy(WholeModule, MultiInputPolicy):
         settings = GoalPolicySettings(action_l2=action_l2, target_clip=target_clip)
         self.action_l2 = settings.action_l2
         self.target_clip = settings.target_clip
-        kwargs = {"net_arch": [256, 256, 256], **with_fused_adam(kwargs)}
+        kwargs = with_fused_adam(kwargs)
+        if kwargs.get("net_arch") is None:
+            kwargs = {**kwargs, "net_arch": [256, 256, 256]}
         with usual_defaults():
             super().__init__(observation_space, action_space, lr_schedule, **kwargs)
 
@@ -86,7 +88,8 @@ class _PricedActor(Actor):
 
     def forward(self, obs: Any) -> th.Tensor:
         actions = super().forward(obs)
-        if actions.requires_grad and self.action_l2:
+        # A hook is another each time, which tracing refuses; what is exported needs none.
+        if actions.requires_grad and self.action_l2 and not th.jit.is_tracing():
             price = 2.0 * self.action_l2 / actions.numel() * actions.detach()
             actions.register_hook(lambda gradient: gradient + price)
         return actions

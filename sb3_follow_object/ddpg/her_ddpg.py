@@ -90,12 +90,13 @@ class HerDDPG(KeptDDPG):
         policy_kwargs: of `HerPolicy`, `critic_layer_norm` among them; `mirrors` may be "auto", what
             the environment's attribute `mirrors` names.
 
-    The other arguments are DDPG's.
+    The other arguments are DDPG's, without `n_steps`: hindsight relabels single steps.
 
     Raises:
         ValueError: for an environment without goals or with images, in VecNormalize or in
-            VecFrameStack, an argument outside its range, or, at the first update, rewards outside
-            of [-1, 0] with `target_clip` "auto" or others than -1 and 0 with `hindsight_bound`.
+            VecFrameStack, an argument outside its range, or, at the first update in it, rewards
+            outside of [-1, 0] with `target_clip` "auto" or others than -1 and 0 with
+            `hindsight_bound`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": HerPolicy}
@@ -103,6 +104,7 @@ class HerDDPG(KeptDDPG):
     # Of `train_freq` in episodes of several environments: as asked for, and what it stands for.
     _episodes: TrainFreq | None = None
     _steps_of_episodes: TrainFreq | None = None
+    _rewards_are_checked = False  # those of the environment that it has
 
     def __init__(
         self,
@@ -250,6 +252,7 @@ class HerDDPG(KeptDDPG):
                 self.auxiliary_critic = make_auxiliary(
                     self.auxiliary, self.policy, rate, self.gamma
                 )
+        self._rewards_are_checked = False
         self._updates = Updates(self)
         self._device_replay = self._make_device_replay()
         self._follow_horizon()
@@ -286,6 +289,7 @@ class HerDDPG(KeptDDPG):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:  # noqa: D102
         makes_replay = self.replay_buffer is None
         super().set_env(env, force_reset)
+        self._rewards_are_checked = False
         self._follow_horizon()
         warn_of_other_planes(self.policy.mirrors, self.env)
         if makes_replay:
@@ -353,8 +357,9 @@ class HerDDPG(KeptDDPG):
         told: list[th.Tensor] = []
         for n in self._chunks(gradient_steps, batch_size):
             data, steps_to_goal = self._sample(n * batch_size, n)
-            if self._n_updates == 0:
+            if not self._rewards_are_checked:
                 check_rewards(data.rewards, self.target_clip == "auto", self.hindsight_bound)
+                self._rewards_are_checked = True
             bounds = (th.pow(self.gamma, steps_to_goal) - 1.0) / (1.0 - self.gamma)
             # All networks share their input moments, so features are computed once.
             chunk = Transitions(

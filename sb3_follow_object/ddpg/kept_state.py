@@ -47,7 +47,7 @@ class KeptDDPG(WholeCopies, WholeEpisodesDDPG):
             return
         own_seed = self.replay_buffer_kwargs.get("seed") is not None
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer) and not own_seed:
-            self.replay_buffer.rng = np.random.default_rng(np.random.randint(2**31))
+            self.replay_buffer.seed(np.random.randint(2**31))
         self.rng = np.random.default_rng(np.random.randint(2**31))
         if self._device_replay is not None:
             self._device_replay.generator.manual_seed(np.random.randint(2**31))

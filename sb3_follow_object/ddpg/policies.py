@@ -23,6 +23,8 @@ from .layer_norm import LayerNorm
 
 one_thread_after_forks()
 
+_KERNELS = {"fused", "foreach", "differentiable"}  # of Adam's, one of them at a time
+
 
 class NormalizedGoalExtractor(BaseFeaturesExtractor):
     """Observation and desired goal, standardised and clipped, as one vector.
@@ -124,11 +126,14 @@ def _extractor_of(network: Actor | ContinuousCritic) -> NormalizedGoalExtractor:
 def with_fused_adam(kwargs: dict[str, Any]) -> dict[str, Any]:
     """Return a policy's arguments with one kernel for all parameters, where its optimiser has it.
 
-    An update is memory-bound otherwise.
+    An update is memory-bound otherwise. A kernel that was chosen stays.
     """
     if kwargs.get("optimizer_class", th.optim.Adam) not in (th.optim.Adam, th.optim.AdamW):
         return kwargs
-    return {**kwargs, "optimizer_kwargs": {"fused": True, **(kwargs.get("optimizer_kwargs") or {})}}
+    given = kwargs.get("optimizer_kwargs") or {}
+    if not _KERNELS.isdisjoint(given):
+        return kwargs
+    return {**kwargs, "optimizer_kwargs": {"fused": True, **given}}
 
 
 class HerPolicy(WholeModule, TD3Policy):

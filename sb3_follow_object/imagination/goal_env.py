@@ -52,6 +52,15 @@ def checked_goals(
     return found, goals.dtype
 
 
+def check_reaches_outside(reaches: bool) -> None:
+    """Refuse an environment inside of which reaching is: it would reach for unseen goals."""
+    if reaches:
+        raise ValueError(
+            "imagined goals go inside of reaching first: put ReachFirstVecEnv or ReachFirstWrapper "
+            "around ImaginedGoalVecEnv or ImaginedGoalWrapper, not inside it"
+        )
+
+
 def terminal_observation(info: dict[str, Any]) -> Observation:
     """Return the observation that an episode ended with.
 

@@ -26,6 +26,7 @@ from .goal_env import (
     Observation,
     check_goal_stays,
     check_horizons,
+    check_reaches_outside,
     checked_goals,
     success_method,
     terminal_observation,
@@ -85,6 +86,7 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
                 "ImaginedGoalVecEnv takes a GoalPredictor (get_predictor makes one) and a "
                 f"Curriculum, not {type(predictor).__name__} and {type(curriculum).__name__}"
             )
+        check_reaches_outside(hasattr(venv, "set_reach") or venv.has_attr("set_reach"))
         super().__init__(venv)
         self._space, self._dtype = checked_goals(venv.observation_space, venv.has_attr)
         check_horizons(predictor, curriculum)
@@ -287,16 +289,28 @@ def _read_contexts(venv: VecEnv, rows: Sequence[int] | np.ndarray, names: Sequen
     return np.reshape(read, (len(rows), len(names)))
 
 
+def curriculum_of(env: VecEnv | None) -> Curriculum | None:
+    """Return the curriculum that an environment's goals come from; None where it imagines none.
+
+    An environment's own attribute of that name is another thing.
+    """
+    if env is None or not env.has_attr("curriculum"):
+        return None
+    (found,) = env.get_attr("curriculum", indices=[0])
+    return found if isinstance(found, Curriculum) else None
+
+
 def imagination_of(env: VecEnv | None, asker: str) -> tuple[GoalPredictor, Curriculum]:
     """Return the predictor and the curriculum that an environment's goals come from.
 
     Raises:
         ValueError: the environment imagines no goals; the message begins with ``asker``.
     """
-    if env is None or not env.has_attr("curriculum"):
+    curriculum = curriculum_of(env)
+    if env is None or curriculum is None:
         raise ValueError(
             f"{asker} needs an environment wrapped in ImaginedGoalVecEnv or ImaginedGoalWrapper; "
             "this one imagines no goals"
         )
     predictor = env.get_attr("predictor", indices=[0])[0]
-    return predictor, env.get_attr("curriculum", indices=[0])[0]
+    return predictor, curriculum

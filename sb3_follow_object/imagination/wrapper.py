@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -20,6 +22,7 @@ from ..common.copies import WholeCopies
 from ..common.numbers import shown
 from ..common.providers import provider
 from ..envs import IDS, physics_id
+from ..envs.goal_envs import has_method
 from ..envs.robot_copies import with_face
 from .curriculum import Curriculum
 from .goal_env import (
@@ -28,11 +31,13 @@ from .goal_env import (
     Observation,
     check_goal_stays,
     check_horizons,
+    check_reaches_outside,
     checked_goals,
     success_method,
 )
 from .goal_predictor import GoalPredictor
 from .imagined_goals import ahead, draw_goals, imagine
+from .predictor_files import FACTS_FILE, checked_facts
 
 AUTO = "auto"  # the predictor that is kept for the environment's task, learned where it is not
 
@@ -58,7 +63,7 @@ class ImaginedGoalWrapper(
         predictor: F_phi; or the folder it was saved in; or "auto", the one that ``get_predictor``
             keeps for this task. The last two are loaded when first needed.
         curriculum: its k_max is read at each reset; or keyword arguments of ``Curriculum`` besides
-            the horizon.
+            the horizon, which is then the predictor's.
 
     Attributes:
         active: whether episodes that begin show imagined goals.
@@ -66,8 +71,8 @@ class ImaginedGoalWrapper(
             CurriculumCallback makes for its tests.
 
     Raises:
-        ValueError: the environment has no 3-D goals, rewards or success for any goal, the
-            predictor and the curriculum have different horizons, or a setting is wrong.
+        ValueError: the environment has no 3-D goals, rewards or success for any goal, or reaches
+            first, the predictor and the curriculum have different horizons, or a setting is wrong.
     """
 
     def __init__(
@@ -82,14 +87,18 @@ class ImaginedGoalWrapper(
                 f"{shown(predictor)}"
             )
         env = with_face(env)
+        check_reaches_outside(env.has_wrapper_attr("set_reach"))
         super().__init__(env)
         self._space, self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)
         self._compute_reward = env.get_wrapper_attr("compute_reward")
-        self._is_success = env.get_wrapper_attr(success_method(env.has_wrapper_attr))
+        judge = success_method(partial(has_method, env.get_wrapper_attr))
+        self._is_success = env.get_wrapper_attr(judge)
         self.active = isinstance(curriculum, Curriculum)
         self.mode = "train"
         self.curriculum = (
-            curriculum if isinstance(curriculum, Curriculum) else _curriculum(env, curriculum)
+            curriculum
+            if isinstance(curriculum, Curriculum)
+            else _curriculum(env, predictor, curriculum)
         )
         self._predictor = predictor
         if isinstance(predictor, GoalPredictor):
@@ -204,15 +213,30 @@ def _find_predictor(source: str | os.PathLike[str], env: gym.Env) -> GoalPredict
     return GoalPredictor.load(source, env_id=env.spec.id, physics=physics)
 
 
-def _curriculum(env: gym.Env, settings: Mapping[str, Any] | None) -> Curriculum:
-    """Return a curriculum of the environment's horizon."""
-    if env.spec is None or env.spec.max_episode_steps is None:
-        raise ValueError(
-            "The environment does not say how long its episodes are (spec.max_episode_steps); "
-            "give a Curriculum."
-        )
-    try:
+def _curriculum(
+    env: gym.Env,
+    predictor: GoalPredictor | str | os.PathLike[str],
+    settings: Mapping[str, Any] | None,
+) -> Curriculum:
+    """Return a curriculum of the predictor's horizon; before there is one, of the object's."""
+    horizon = _horizon(predictor)
+    if horizon is None:
+        if env.spec is None or env.spec.max_episode_steps is None:
+            raise ValueError(
+                "The environment does not say how long its episodes are (spec.max_episode_steps); "
+                "give a Curriculum."
+            )
         horizon = steps_of_object(env.spec.id, env.spec.max_episode_steps)
+    try:
         return Curriculum(horizon, **(settings or {}))
     except TypeError as error:
         raise ValueError(f"The curriculum cannot have these settings: {error}.") from error
+
+
+def _horizon(predictor: GoalPredictor | str | os.PathLike[str]) -> int | None:
+    """Return T of a predictor, or of the one that its folder says it holds; None, of none yet."""
+    if isinstance(predictor, GoalPredictor):
+        return predictor.horizon
+    if predictor == AUTO or not (facts := Path(predictor) / FACTS_FILE).exists():
+        return None
+    return int(checked_facts(facts)["horizon"])

@@ -18,6 +18,7 @@ from ..envs.tasks import SUCCESS_DISTANCE
 from .her_replay_buffer import FollowObjectReplayBuffer
 from .record_buffer import ACHIEVED, DESIRED, HALVES, NEXT_DESIRED
 from .records import Records
+from .steps import refuse_margin
 
 _PROBES = 1000  # transitions that an environment's reward is compared on
 _FAR = 0.01, 50.0  # metres apart that every second of them is, on a logarithmic scale
@@ -133,6 +134,8 @@ class DeviceReplay(WholeCopies):
             raise ValueError("the replay buffer has no environment: call set_env() after loading")
         goal_size = buffer.observations["desired_goal"].shape[-1]
         self.reward = DistanceReward.of(buffer.env, goal_size)
+        if buffer.goal_margin > 0.0 and self.reward.threshold is None:
+            refuse_margin()
         self._env = buffer.env
 
     def __setstate__(self, state: dict[str, Any]) -> None:

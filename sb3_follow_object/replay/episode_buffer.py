@@ -130,7 +130,8 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         VecNormalize keeps raw observations, but of an episode's last one only what it has scaled
         and clipped, and SB3 cannot undo the clipping: a first lift would be a lift of millimetres.
         The wrappers of imagined goals and of reaching tell it as it was (`LAST`), where no wrapper
-        outside of them ends the episode. Elsewhere it stays clipped, with a warning, once.
+        outside of them ends the episode. What these add or change stays clipped, entry by entry,
+        with a warning, once.
         """
         ended = np.flatnonzero(done)
         normalizer = unwrap_vec_normalize(self.env) if ended.size and self.env else None
@@ -138,22 +139,26 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
             return next_obs
         next_obs = {key: np.array(value) for key, value in next_obs.items()}
         for env_idx in ended:
-            last = infos[env_idx].get(LAST)
             seen = infos[env_idx].get("terminal_observation")
-            if last is None:
-                self._warn_if_clipped(normalizer, seen)
-            if last is None or seen is None:
+            if not isinstance(seen, dict):
                 continue
-            scaled = normalizer.normalize_obs(last)
-            # Where another wrapper has changed it since, it is not what the policy saw.
-            if all(np.array_equal(scaled[key], seen[key]) for key in scaled):
-                for key, value in last.items():
-                    next_obs[key][env_idx] = value
+            row = {key: value[env_idx] for key, value in next_obs.items()}
+            last = {
+                key: value
+                for key, value in (infos[env_idx].get(LAST) or {}).items()
+                if key in row and np.shape(value) == row[key].shape
+            }
+            scaled: Any = normalizer.normalize_obs({**row, **last})
+            # What another wrapper has changed since is not what the policy saw.
+            same = {key for key in last if np.array_equal(scaled[key], seen[key])}
+            for key in same:
+                next_obs[key][env_idx] = last[key]
+            self._warn_if_clipped(normalizer, {key: seen[key] for key in seen if key not in same})
         return next_obs
 
-    def _warn_if_clipped(self, normalizer: VecNormalize, seen: Any) -> None:
-        """Warn, once, where VecNormalize has clipped an episode's last observation."""
-        if self._warned_of_clipping or not normalizer.norm_obs or not isinstance(seen, dict):
+    def _warn_if_clipped(self, normalizer: VecNormalize, seen: dict[str, np.ndarray]) -> None:
+        """Warn, once, where VecNormalize has clipped what is stored of a last observation."""
+        if self._warned_of_clipping or not normalizer.norm_obs:
             return
         limit = np.float32(normalizer.clip_obs)
         for key in normalizer.norm_obs_keys or ():
@@ -163,7 +168,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
                     f"VecNormalize has clipped {key!r} of an episode's last observation at "
                     f"clip_obs {limit:g}, and so it is stored: nothing told it as it was. Put the "
                     "environment into ImaginedGoalWrapper or ReachFirstWrapper with its time limit "
-                    "inside, or raise clip_obs",
+                    "and what changes observations inside, or raise clip_obs",
                     stacklevel=4,
                 )
                 return

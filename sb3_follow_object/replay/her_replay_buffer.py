@@ -14,14 +14,16 @@ from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
 from ..common.answers import one_each
 from ..common.numbers import checked_whole
+from ..imagination.curriculum import Curriculum
+from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.imagined_goals import imagine_afar
-from ..imagination.vec_env import imagination_of
+from ..imagination.vec_env import curriculum_of, imagination_of
 from ..settings.learning import ReplaySettings
 from .cher import GoalSelection
 from .episode_buffer import EpisodeReplayBuffer
 from .episode_table import EpisodeTable
 from .record_buffer import NEXT_DESIRED
-from .steps import check_actions, check_copies
+from .steps import check_actions, check_copies, check_two_valued
 
 RewardFunction = Callable[[np.ndarray, np.ndarray, list[dict[str, Any]]], np.ndarray]
 Strategy = GoalSelectionStrategy | str
@@ -39,8 +41,9 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
     Args:
         imagined_ratio: share in [0, 1] of the virtual transitions relabelled with a goal that
             F_phi imagines from the episode's start and original goal, at a level of the current
-            curriculum, instead of with an achieved goal. 0 is the paper's setting. Above 0, the
-            environment must be wrapped in `ImaginedGoalVecEnv` or `ImaginedGoalWrapper`.
+            curriculum, instead of with an achieved goal, until the curriculum is finished. 0 is the
+            paper's setting. Above 0, the environment must be wrapped in `ImaginedGoalVecEnv` or
+            `ImaginedGoalWrapper`.
         moved_ratio: share in [0, 1] of each batch drawn only from episodes in which the achieved
             goal moved by more than `moved_distance`; the rest is drawn from all. 0 is the paper's.
         moved_distance: metres.
@@ -60,24 +63,26 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         goal_margin: share in [0, 1) of the tolerance at whose outer edge a goal does not count as
             reached in what is learned from: a policy whose actions have a price moves the object as
             little as will do, and what stops at the edge often stops beyond it. For environments
-            that pay by whether a goal is near enough. 0 is the paper's.
+            that pay by whether a goal is near enough, one of two rewards. 0 is the paper's.
         cher: keyword arguments of `GoalSelection`, which then chooses each batch from more
             candidates; None chooses nothing.
         reward_function: called as f(achieved (n, d), desired (n, d), infos) -> (n,); by default the
             `compute_reward` of the first environment is asked, which costs a round trip between
             processes in a SubprocVecEnv.
         seed: of the buffer's own generator; by default drawn from NumPy's global one, which SB3
-            seeds.
+            seeds as it makes a model. A stock algorithm's `set_random_seed` does not reach it
+            later: call `seed` too. That of `HerDDPG` does.
 
     The other arguments are HerReplayBuffer's.
 
     Raises:
         ValueError: an argument is outside its range, actions have no bounds, imagined goals are
             asked for without the wrapper that imagines them, or, at the first step, an episode does
-            not fit.
+            not fit; or, at a sample with `goal_margin`, there are more than two rewards.
     """
 
     goal_margin = scene_distance = 0.0  # of buffers pickled before there were any
+    _predictor: GoalPredictor | None = None  # the environment's, once it was asked for it
 
     def __init__(
         self,
@@ -171,6 +176,14 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         self.table = EpisodeTable()
         self.revision = 0  # counts how often the content was loaded or forgotten
 
+    def seed(self, seed: int) -> None:
+        """Begin the buffer's own generator anew.
+
+        Raises:
+            ValueError: it is no whole number of at least 0.
+        """
+        self.rng = np.random.default_rng(checked_whole("seed", seed, 0))
+
     def set_env(self, env: VecEnv) -> None:
         """Ask another environment for rewards and imagined goals from now on.
 
@@ -183,7 +196,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         self.check_env(env)
         if self.env is not None and env is not self.env:
             self.end_episodes()
-        self.env = env
+        self.env, self._predictor = env, None
         if self.size() == 0:
             self._make_room_for_contexts(env)
 
@@ -276,6 +289,9 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         }
         return stores | {name: store for name, store in of_size.items() if store.size}
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_predictor": None}  # the environment's, as is `env`
+
     def selection_log(self) -> dict[str, float]:
         """Return what there is to log about how batches are chosen."""
         if self.selection is None:
@@ -335,7 +351,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             virtual, steps = virtual.take(kept), steps.take(kept)
             goals = goals.take(kept, axis=0)
         goals = self._goals_in(goals)
-        if self.imagined_ratio > 0.0:
+        if self.imagined_ratio > 0.0 and not self._imagination()[1].finished:
             chosen = np.flatnonzero(self.rng.random(len(virtual)) < self.imagined_ratio)
             goals[chosen] = self._imagined_goals(episode[virtual[chosen]])
             steps[chosen] = np.inf
@@ -349,6 +365,8 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         reached = self._goals_in(achieved.take(judged, axis=0))
         shown = batch.observations["desired_goal"].take(judged, axis=0)
         batch.rewards[judged] = self._reward(reached, shown, flat.take(judged))
+        if self.goal_margin > 0.0:
+            check_two_valued(batch.rewards)
 
         if self.selection is not None:
             chosen = self.selection.choose(
@@ -400,20 +418,26 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
     def _usable(self, flat: np.ndarray) -> np.ndarray | None:
         """Which of these transitions' achieved goals may be hindsight goals (n,); None, all."""
         far = self._take(self._far, flat) if self.min_goal_distance > 0.0 else None
-        if self.scene_distance == 0.0 or self._imagines():
+        if self.scene_distance == 0.0 or not self._is_finished():
             return far
         as_asked = ~self._take(self._amiss, flat)
         return as_asked if far is None else far & as_asked
 
-    def _imagines(self) -> bool:
-        """Whether imagined goals are shown, around which nothing stands."""
-        if self.env is None or not self.env.has_attr("curriculum"):
-            return False
-        return not self.env.get_attr("curriculum", indices=[0])[0].finished
+    def _is_finished(self) -> bool:
+        """Whether no imagined goals are shown any more, around which nothing stands."""
+        curriculum = curriculum_of(self.env)
+        return curriculum is None or curriculum.finished
+
+    def _imagination(self) -> tuple[GoalPredictor, Curriculum]:
+        """The environment's predictor, which another process sends but once, and its curriculum."""
+        if self._predictor is None or self.env is None:
+            self._predictor, curriculum = imagination_of(self.env, IMAGINED_RATIO)
+            return self._predictor, curriculum
+        return self._predictor, self.env.get_attr("curriculum", indices=[0])[0]
 
     def _imagined_goals(self, episode: np.ndarray) -> np.ndarray:
         """F_phi(o_1, g, k) of each episode at a level that it could have shown, (n, d)."""
-        predictor, curriculum = imagination_of(self.env, IMAGINED_RATIO)
+        predictor, curriculum = self._imagination()
         first = episode[:, 0], episode[:, 1]
         start = self.observations["achieved_goal"][first]
         goal = self.original_goals[first]

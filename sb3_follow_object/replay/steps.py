@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -30,6 +30,20 @@ def check_actions(space: spaces.Space) -> None:
             "the action space must have finite bounds, each low below its high, to be scaled to "
             f"[-1, 1]; it is {space}"
         )
+
+
+def check_two_valued(rewards: np.ndarray) -> None:
+    """Raise a ValueError unless rewards (n,) are one of two, as `goal_margin` needs them."""
+    if ((rewards != rewards.min()) & (rewards != rewards.max())).any():
+        refuse_margin()
+
+
+def refuse_margin() -> NoReturn:
+    """Raise the ValueError of rewards that a `goal_margin` would scale."""
+    raise ValueError(
+        "goal_margin is for environments that pay by whether a goal is near enough; this one's "
+        "compute_reward gives more than two rewards: set goal_margin to 0"
+    )
 
 
 def fitted(array: Any, shape: tuple[int, ...], what: str) -> np.ndarray:

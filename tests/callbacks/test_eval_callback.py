@@ -13,11 +13,13 @@ import toy
 from imagined import N, bare, imagining, learner
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_follow_object.callbacks import eval_callback
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
 from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
+from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -140,6 +142,85 @@ def test_only_training_counts_as_training_time(monkeypatch: pytest.MonkeyPatch) 
         assert evaluation.wall_s == pytest.approx(ends_at)
         now[0] += 1000.0  # a pause
         assert evaluation.wall_s == pytest.approx(ends_at)
+
+
+class Kept(KVWriter):
+    """What is dumped, and with which step."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[int, dict[str, Any]]] = []
+
+    def write(self, key_values: dict[str, Any], key_excluded: Any, step: int = 0) -> None:
+        self.rows.append((step, dict(key_values)))
+
+
+class Dumps(BaseCallback):
+    """Dumps after each rollout, as a run in a folder does after its validations."""
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.logger.dump(-self.num_timesteps)
+
+
+@pytest.mark.parametrize("dumped_by_another", [False, True])
+def test_an_evaluation_is_dumped_with_its_step_unless_another_has_done_it(
+    dumped_by_another: bool,
+) -> None:
+    model, kept = learner(bare()), Kept()
+    model.set_logger(Logger(None, [kept]))
+    others = [Dumps()] if dumped_by_another else []
+    model.learn(
+        3 * N * toy.HORIZON,
+        [OriginalGoalEvalCallback(bare(), N, N * toy.HORIZON), *others],
+        log_interval=None,
+    )
+    told = [(step, "time/total_timesteps" in row) for step, row in kept.rows]
+    sign = -1 if dumped_by_another else 1
+    assert told == [(sign * n * N * toy.HORIZON, not dumped_by_another) for n in (1, 2, 3)]
+    assert all("eval/success_rate" in row for _, row in kept.rows)
+
+
+def test_a_verbose_evaluation_prints_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for verbose in (0, 1):
+        evaluation = OriginalGoalEvalCallback(bare(), N, 40, verbose=verbose)
+        learner(bare()).learn(40, callback=evaluation)
+        said = capsys.readouterr().out
+        assert ("evaluation after 40 steps: success rate 0." in said) == bool(verbose)
+
+
+def test_learning_anew_does_not_write_over_a_callbacks_file(tmp_path: Path) -> None:
+    path = tmp_path / "eval.csv"
+    evaluation, model = OriginalGoalEvalCallback(bare(), N, 80, path), learner(bare())
+    model.learn(80, callback=evaluation)
+    model.learn(80, callback=evaluation, reset_num_timesteps=False)
+    written = path.read_bytes()
+    with pytest.raises(ValueError, match="`learn` counts anew: pass reset_num_timesteps=False"):
+        model.learn(80, callback=evaluation)
+    assert path.read_bytes() == written
+
+
+def test_an_environments_own_curriculum_is_another_thing() -> None:
+    class Taught(toy.PointEnv):
+        curriculum = "lessons"
+
+    env = DummyVecEnv([Taught] * N)
+    OriginalGoalEvalCallback(env, N, 40)
+    with pytest.raises(ValueError, match="this one imagines no goals"):
+        learner(env).learn(40, callback=CurriculumCallback())
+    buffer = FollowObjectReplayBuffer(
+        100, env.observation_space, env.action_space, env, n_envs=N, scene_distance=0.1
+    )
+    assert buffer._is_finished()
+
+
+def test_a_recurrent_policy_is_refused() -> None:
+    contrib = pytest.importorskip("sb3_contrib")
+    tiny = {"net_arch": [8], "lstm_hidden_size": 8}
+    model = contrib.RecurrentPPO("MultiInputLstmPolicy", bare(), n_steps=8, policy_kwargs=tiny)
+    with pytest.raises(ValueError, match="the policy of this RecurrentPPO is recurrent"):
+        model.learn(N * 8, callback=OriginalGoalEvalCallback(bare(), N, 8))
 
 
 def test_another_runs_file_is_left_alone(tmp_path: Path) -> None:

@@ -221,6 +221,10 @@ def test_a_callback_is_not_taught_with_other_observations() -> None:
         learner(other).learn(N * HORIZON, callback)
 
 
+def test_it_takes_what_every_callback_of_sb3_takes() -> None:
+    assert ReachCallback(verbose=1).verbose == 1 and CurriculumCallback(verbose=1).verbose == 1
+
+
 def test_a_refused_training_may_be_ended() -> None:
     callback = ReachCallback()
     with pytest.raises(ValueError, match="nothing reaches first"):

@@ -64,6 +64,24 @@ def test_actions_have_their_price_in_the_gradient() -> None:
     assert th.equal(priced.actor(obs), plain.actor(obs))
 
 
+@pytest.mark.filterwarnings("ignore:`torch.jit.trace")
+def test_its_actor_can_be_traced() -> None:
+    net, obs = policy(action_l2=0.7), batch()
+    traced = th.jit.trace(net.actor, (obs,))  # traces twice and compares
+    assert th.equal(traced(obs), net.actor(obs))
+
+
+def test_what_is_left_open_is_the_default_and_a_chosen_kernel_stays() -> None:
+    def made(**settings: Any) -> GoalPolicy:
+        return GoalPolicy(OBSERVATIONS, ACTIONS, lambda _: 1e-3, **settings)
+
+    assert made(net_arch=None).net_arch == made().net_arch == [256, 256, 256]
+    (group,) = made().actor.optimizer.param_groups
+    assert group["fused"]
+    (group,) = made(optimizer_kwargs={"foreach": True}).actor.optimizer.param_groups
+    assert group["foreach"] and not group["fused"]
+
+
 def test_the_target_critic_alone_stays_within_the_bounds() -> None:
     obs, actions = batch(256), th.rand(256, 4) * 2.0 - 1.0
     free = policy()

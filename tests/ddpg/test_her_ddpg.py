@@ -378,6 +378,20 @@ def test_rewards_beyond_the_bounds_of_targets_are_refused(
     HerDDPG("MultiInputPolicy", env, **TINY, target_clip=bounds).learn(100)
 
 
+@pytest.mark.parametrize("loaded", [False, True])
+def test_rewards_of_another_environment_are_checked_too(loaded: bool, tmp_path: Any) -> None:
+    model = make_model()
+    model.learn(100)
+    other: Any = DummyVecEnv([Far] * 4)
+    if loaded:
+        model.save(tmp_path / "model")
+        model = HerDDPG.load(tmp_path / "model", env=other)
+    else:
+        model.set_env(other)
+    with pytest.raises(ValueError, match=r"a reward is .* target_clip 'auto' is for rewards"):
+        model.learn(100)
+
+
 @pytest.mark.parametrize(
     "part", [gym.spaces.Box(0, 255, (8, 8, 1), np.uint8), gym.spaces.MultiDiscrete([3, 2])]
 )

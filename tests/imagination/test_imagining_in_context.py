@@ -219,7 +219,7 @@ def test_processes_of_sb3_need_the_wrapper_in_each_copy(predictor: GoalPredictor
 
 
 def test_imagined_goals_of_replay_lie_on_the_way_past_the_wall(predictor: GoalPredictor) -> None:
-    curriculum = Curriculum(T, k_max=T)
+    curriculum = Curriculum(T, k_max=T, finish_threshold=0.9)
     env = ImaginedGoalVecEnv(in_one_process(), predictor, curriculum)
     env.seed(0)
     buffer = FollowObjectReplayBuffer(

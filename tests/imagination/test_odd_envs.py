@@ -60,6 +60,20 @@ def test_environments_without_goals_are_refused(make: Callable[[], gym.Env], mes
         ImaginedGoalVecEnv(DummyVecEnv([make]), predictor, curriculum)
 
 
+def test_what_has_the_name_of_a_method_and_is_none_judges_nothing() -> None:
+    class Odd(gym.Wrapper):
+        is_success = False
+
+        def _is_success(self, achieved: Any, desired: Any) -> bool:
+            return bool(np.linalg.norm(achieved - desired) <= toy.THRESHOLD)
+
+    env = ImaginedGoalWrapper(Odd(toy.PointEnv()), toy.StraightPredictor(), toy.curriculum(p=0.0))
+    env.reset(seed=0)
+    obs, _, _, _, info = env.step(np.zeros(3, np.float32))
+    near = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"]) <= toy.THRESHOLD
+    assert info["is_success"] == near
+
+
 def test_other_wrong_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match="mode must be one of"):
         imagining(toy.curriculum(), "tset")

@@ -26,6 +26,8 @@ from sb3_follow_object.imagination.curriculum import Curriculum
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
+from sb3_follow_object.reach.vec_env import ReachFirstVecEnv
+from sb3_follow_object.reach.wrapper import ReachFirstWrapper
 
 
 @pytest.mark.parametrize("levels", ["time", "path"])
@@ -46,6 +48,20 @@ def test_goals_in_standard_deviations_are_refused(training: bool) -> None:
     normalised = VecNormalize(DummyVecEnv([toy.PointEnv] * N), training=training)
     with pytest.raises(ValueError, match="put it inside VecNormalize, not around it"):
         ImaginedGoalVecEnv(normalised, toy.StraightPredictor(), toy.curriculum())
+
+
+def test_what_reaches_first_goes_outside() -> None:
+    settings: dict[str, Any] = {"effector": (0, 1, 2), "height": 0.0}
+
+    def reaching() -> gym.Env:
+        return ReachFirstWrapper(toy.PointEnv(), **settings)
+
+    around = ReachFirstVecEnv(DummyVecEnv([toy.PointEnv]), **settings)
+    for inner in (DummyVecEnv([reaching]), around, VecMonitor(around)):
+        with pytest.raises(ValueError, match="imagined goals go inside of reaching first"):
+            ImaginedGoalVecEnv(inner, toy.StraightPredictor(), toy.curriculum())
+    with pytest.raises(ValueError, match="imagined goals go inside of reaching first"):
+        ImaginedGoalWrapper(reaching(), toy.StraightPredictor(), toy.curriculum())
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,11 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import TimeLimit
+from gymnasium import spaces
+from gymnasium.wrappers import FilterObservation, TimeAwareObservation, TimeLimit
 from imagined import imagining
 from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
@@ -95,6 +97,54 @@ def test_where_nothing_tells_it_a_warning_says_once_that_it_is_clipped(make: Any
     assert "last observation at clip_obs 0.5" in sentence
 
 
+def leaps(buffer: Any, key: str) -> np.ndarray:
+    """How far a key's third number went in each episode."""
+    first, last = (slice(at, buffer.pos, HORIZON) for at in (0, HORIZON - 1))
+    went: np.ndarray = buffer.next_observations[key][last] - buffer.observations[key][first]
+    return went[..., 2]
+
+
+class WithMore(Leaping):
+    """Observes another number beside."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        entries = dict(self.observation_space.spaces)  # type: ignore[attr-defined]
+        self.observation_space = spaces.Dict({**entries, "extra": spaces.Box(-1.0, 1.0, (1,))})
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        return {**super()._observe(), "extra": np.zeros(1, np.float32)}
+
+
+def test_what_other_wrappers_add_or_leave_out_does_not_clip_the_rest() -> None:
+    def timed() -> Any:
+        inner = ImaginedGoalWrapper(Leaping(), StraightPredictor(), curriculum())
+        return TimeAwareObservation(TimeLimit(inner, HORIZON), flatten=False)
+
+    def filtered() -> Any:
+        inner = ImaginedGoalWrapper(WithMore(), StraightPredictor(), curriculum())
+        return FilterObservation(inner, ["observation", "achieved_goal", "desired_goal"])
+
+    for make in (timed, filtered):
+        buffer = learn(DummyVecEnv([make] * 2))
+        for key in ("observation", "achieved_goal"):
+            np.testing.assert_allclose(leaps(buffer, key), 2.0, atol=1e-6)
+
+
+def test_what_another_wrapper_changes_is_clipped_alone_with_a_warning() -> None:
+    class Nudged(gym.ObservationWrapper[Any, Any, Any]):
+        def observation(self, observation: Any) -> Any:
+            return {**observation, "observation": observation["observation"] + 0.001}
+
+    def nudged() -> Any:
+        return Nudged(ImaginedGoalWrapper(Leaping(), StraightPredictor(), curriculum()))
+
+    with pytest.warns(UserWarning, match="VecNormalize has clipped 'observation' of an episode's"):
+        buffer = learn(DummyVecEnv([nudged] * 2))
+    np.testing.assert_allclose(leaps(buffer, "achieved_goal"), 2.0, atol=1e-6)
+    assert leaps(buffer, "observation").min() < 1.0, "it is as the policy saw it"
+
+
 def test_what_is_not_clipped_there_needs_no_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -117,6 +167,8 @@ def test_what_another_wrapper_has_changed_is_not_taken_back() -> None:
     for _ in range(HORIZON):
         obs, _, dones, infos = env.step(np.zeros((2, 3), np.float32))
     assert dones.all() and isinstance(obs, dict)
-    kept = buffer._with_last_observations(obs, dones, infos)
-    for key, value in obs.items():
-        np.testing.assert_array_equal(kept[key], value)
+    with pytest.warns(UserWarning, match="VecNormalize has clipped 'observation'"):
+        kept = buffer._with_last_observations(obs, dones, infos)
+    np.testing.assert_array_equal(kept["observation"], obs["observation"])
+    told = np.array([info["last_observation"]["achieved_goal"] for info in infos])
+    np.testing.assert_allclose(kept["achieved_goal"], told, atol=1e-6)

@@ -225,13 +225,15 @@ def test_a_predictor_for_another_task_is_refused(cache: Path) -> None:
 
 
 def test_the_script_in_the_docs_runs(tmp_path: Path) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sb3.md").read_text(), re.DOTALL)
-    script, single = blocks
+    page = (ROOT / "docs" / "sb3.md").read_text()
+    script, single = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (played,) = re.findall(r"```py\n(.*?)```", page, re.DOTALL)
     assert len(script.strip().splitlines()) <= 22
     for written, tried in (("300_000", "4_900"), ("PnPShelf", "PushSideGap")):
         assert script.count(written) == 1
         script = script.replace(written, tried)
-    output = run([sys.executable, "-c", script], cwd=tmp_path)
+    still = "assert played.training is False and not played.has_attr('curriculum')\n"
+    output = run([sys.executable, "-c", script + played + still], cwd=tmp_path)
     assert "test_success" in output and "k_max" in output and "critic_loss" in output
     assert (tmp_path / "shelf.zip").exists()
     exec(single, names := {})

@@ -75,6 +75,16 @@ def test_a_margin_asks_goals_to_be_reached_more_closely(where: str, n_sampled_go
     assert buffer.rewards.max() == 0.0, "what is stored is what was paid"
 
 
+def test_a_margin_that_would_scale_the_rewards_is_refused() -> None:
+    env = make_env(env_class=DensePointEnv)
+    buffer = make_buffer(env, goal_margin=0.3)
+    fill([buffer], env, 100)
+    with pytest.raises(ValueError, match=r"goal_margin .* gives more than two rewards"):
+        buffer.sample(64)
+    with pytest.raises(ValueError, match=r"goal_margin .* gives more than two rewards"):
+        mirror(buffer)
+
+
 @pytest.mark.parametrize(
     "options",
     [

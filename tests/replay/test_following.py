@@ -47,7 +47,7 @@ def relabelled(buffer: Any) -> np.ndarray:
 
 
 def test_rewards_are_asked_of_the_environment_that_was_set() -> None:
-    model = learner("HerDDPG", make_env())
+    model = learner("HerDDPG", make_env(), target_clip=(-20.0, 0.0))
     model.learn(5 * 2 * HORIZON)
     model.env.close()
     model.set_env(make_env(env_class=Paying))

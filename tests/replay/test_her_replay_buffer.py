@@ -165,6 +165,55 @@ def test_imagined_ratio_shows_no_level_that_training_would_not() -> None:
         assert far.min() > nearest - 1e-5 and far.max() < 0.2 + 1e-5
 
 
+def test_imagined_ratio_ends_with_the_curriculum() -> None:
+    curriculum = Curriculum(HORIZON, k_max=3, p=0.5)
+    env = ImaginedGoalVecEnv(make_env(), StraightPredictor(), curriculum)
+    env.seed(0)
+    buffer = make_buffer(env, imagined_ratio=1.0, n_sampled_goal=10**9)
+    fill([buffer], env, 20 * HORIZON)
+    curriculum.k_max = curriculum.n_levels
+    achieved = buffer.next_observations["achieved_goal"][: buffer.pos].reshape(-1, 3)
+    goals = as_arrays(buffer.sample(200))["goal"]
+    assert (goals[:, None] == achieved[None]).all(axis=2).any(axis=1).all()
+
+
+def test_the_predictor_is_asked_for_once() -> None:
+    class Asked(ImaginedGoalVecEnv):
+        names: list[str]
+
+        def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+            self.names.append(attr_name)
+            return super().get_attr(attr_name, indices)
+
+    Asked.names = []
+    env = Asked(make_env(), StraightPredictor(), Curriculum(HORIZON))
+    buffer = make_buffer(env, imagined_ratio=0.5)
+    fill([buffer], env, 2 * HORIZON)
+    buffer.sample(20)
+    Asked.names.clear()
+    for _ in range(3):
+        buffer.sample(20)
+    assert "predictor" not in Asked.names and "curriculum" in Asked.names
+    other = pickle.loads(pickle.dumps(buffer))
+    other.set_env(ImaginedGoalVecEnv(make_env(), StraightPredictor(), Curriculum(HORIZON)))
+    other.sample(20)
+    assert other._predictor is other.env.predictor
+
+
+def test_a_seed_begins_the_generator_anew() -> None:
+    env = make_env()
+    buffer = make_buffer(env)
+    fill([buffer], env, 2 * HORIZON)
+    drawn = []
+    for seed in (3, 3, 4):
+        buffer.seed(seed)
+        drawn.append(as_arrays(buffer.sample(50))["obs"])
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    assert not np.array_equal(drawn[0], drawn[2])
+    with pytest.raises(ValueError, match="seed is -1; it must be at least 0"):
+        buffer.seed(-1)
+
+
 @pytest.mark.parametrize("imagines", [False, True])
 def test_hindsight_goals_where_other_goals_lie_are_left_out(imagines: bool) -> None:
     goals = np.array([[0.2, 0.0, 0.0], [0.0, 0.2, 0.0]])
