@@ -114,7 +114,7 @@ def check_goal_stays(given: np.ndarray, original: np.ndarray) -> None:
         )
 
 
-def success_method(has: Callable[[str], bool]) -> str:
+def needed_success_method(has: Callable[[str], bool]) -> str:
     """Return the name of the environment's method that judges any goal."""
     for name in SUCCESS_METHODS:
         if has(name):

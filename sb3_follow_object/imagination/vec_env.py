@@ -28,7 +28,7 @@ from .goal_env import (
     check_horizons,
     check_reaches_outside,
     checked_goals,
-    success_method,
+    needed_success_method,
     terminal_observation,
 )
 from .goal_predictor import GoalPredictor
@@ -90,7 +90,7 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
         super().__init__(venv)
         self._space, self._dtype = checked_goals(venv.observation_space, venv.has_attr)
         check_horizons(predictor, curriculum)
-        self._success_method = success_method(venv.has_attr)
+        self._success_method = needed_success_method(venv.has_attr)
         self.predictor = predictor
         self.curriculum = curriculum
         self.mode = mode

@@ -33,7 +33,7 @@ from .goal_env import (
     check_horizons,
     check_reaches_outside,
     checked_goals,
-    success_method,
+    needed_success_method,
 )
 from .goal_predictor import GoalPredictor
 from .imagined_goals import ahead, draw_goals, imagine
@@ -91,7 +91,7 @@ class ImaginedGoalWrapper(
         super().__init__(env)
         self._space, self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)
         self._compute_reward = env.get_wrapper_attr("compute_reward")
-        judge = success_method(partial(has_method, env.get_wrapper_attr))
+        judge = needed_success_method(partial(has_method, env.get_wrapper_attr))
         self._is_success = env.get_wrapper_attr(judge)
         self.active = isinstance(curriculum, Curriculum)
         self.mode = "train"

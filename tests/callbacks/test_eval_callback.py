@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import toy
 from imagined import N, bare, imagining, learner
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
@@ -216,9 +217,8 @@ def test_an_environments_own_curriculum_is_another_thing() -> None:
 
 
 def test_a_recurrent_policy_is_refused() -> None:
-    contrib = pytest.importorskip("sb3_contrib")
     tiny = {"net_arch": [8], "lstm_hidden_size": 8}
-    model = contrib.RecurrentPPO("MultiInputLstmPolicy", bare(), n_steps=8, policy_kwargs=tiny)
+    model = RecurrentPPO("MultiInputLstmPolicy", bare(), n_steps=8, policy_kwargs=tiny)
     with pytest.raises(ValueError, match="the policy of this RecurrentPPO is recurrent"):
         model.learn(N * 8, callback=OriginalGoalEvalCallback(bare(), N, 8))
 

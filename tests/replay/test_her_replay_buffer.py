@@ -137,12 +137,18 @@ def test_hindsight_goals_lie_away_from_where_the_episode_began() -> None:
     np.testing.assert_array_equal(got["reward"], expected)
 
 
-def test_imagined_ratio_relabels_with_imagined_goals() -> None:
-    curriculum = Curriculum(HORIZON, k_max=3, p=0.5)
+def imagining_buffer(curriculum: Curriculum) -> FollowObjectReplayBuffer:
+    """Twenty episodes, of which every goal that is learned from is imagined."""
     env = ImaginedGoalVecEnv(make_env(), StraightPredictor(), curriculum)
     env.seed(0)
     buffer = make_buffer(env, imagined_ratio=1.0, n_sampled_goal=10**9)
     fill([buffer], env, 20 * HORIZON)
+    return buffer
+
+
+def test_imagined_ratio_relabels_with_imagined_goals() -> None:
+    curriculum = Curriculum(HORIZON, k_max=3, p=0.5)
+    buffer = imagining_buffer(curriculum)
     got = as_arrays(buffer.sample(3000))
     starts = buffer.observations["achieved_goal"][::HORIZON].reshape(-1, 3)
     distance = np.linalg.norm(got["goal"][:, None] - starts[None], axis=2)
@@ -167,10 +173,7 @@ def test_imagined_ratio_shows_no_level_that_training_would_not() -> None:
 
 def test_imagined_ratio_ends_with_the_curriculum() -> None:
     curriculum = Curriculum(HORIZON, k_max=3, p=0.5)
-    env = ImaginedGoalVecEnv(make_env(), StraightPredictor(), curriculum)
-    env.seed(0)
-    buffer = make_buffer(env, imagined_ratio=1.0, n_sampled_goal=10**9)
-    fill([buffer], env, 20 * HORIZON)
+    buffer = imagining_buffer(curriculum)
     curriculum.k_max = curriculum.n_levels
     achieved = buffer.next_observations["achieved_goal"][: buffer.pos].reshape(-1, 3)
     goals = as_arrays(buffer.sample(200))["goal"]
