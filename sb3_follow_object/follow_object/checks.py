@@ -13,12 +13,12 @@ from ..common.torch_helpers import usable_device
 from ..ddpg.her_ddpg import HerDDPG
 from ..object_stage.networks import check_readable
 from ..object_stage.sldr import task_of_package
-from ..reach.approach import BEHIND, check_reachable, reach_first_settings
+from ..reach.approach import check_reachable, reach_first_settings
 from ..replay.steps import refuse_margin
 from ..settings.fields import settings_of
 from ..settings.learning import PredictorSettings
 from ..settings.sizes import check_stages
-from ..settings.stages import ReachFirstSettings, ReachTeachingSettings
+from ..settings.stages import BEHIND, ReachFirstSettings, ReachTeachingSettings
 
 
 def check_algorithms(

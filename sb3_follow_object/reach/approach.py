@@ -15,13 +15,12 @@ from ..any_task.tasks import effector_seen_in, steps_to_reach
 from ..envs import IDS
 from ..envs.goal_envs import missing_goal_keys
 from ..envs.goal_space import followed_space, goal_space
-from ..settings.stages import ReachFirstSettings, part_of_reach
+from ..settings.stages import BEHIND, ReachFirstSettings, part_of_reach
 from .actor import ReachActor
 
 Observation = dict[str, np.ndarray]
 STREAM = 0x5EAC  # parts the reaching's random numbers from those of the environment's own seed
 AHEAD = 0.1  # metres of the object's way, whose end says where it shall go next
-BEHIND = 0.06  # metres, the standoff where objects are pushed
 ABOVE, TO_PLACE, PUSH = 0, 1, 2  # legs of the effector's way
 
 

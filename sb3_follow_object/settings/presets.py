@@ -32,7 +32,7 @@ from .methods import METHODS as METHODS
 from .methods import STOCK, WITHOUT_PAPER, check_methods
 from .run_config import CONFIG, RunConfig
 from .sizes import check_sizes
-from .stages import ReachTeachingSettings, StageSettings
+from .stages import BEHIND, ReachTeachingSettings, StageSettings
 from .table import check_dotted
 from .zoo_yaml import SIMILAR, WRAPPER, ZooFile, of_data, with_numbers
 
@@ -175,21 +175,36 @@ def _task_settings(known: ZooFile, env_id: str, imagine: bool, report: Report) -
     """Return what a file says of a task, its object's stage included, as fits the task."""
     settings = known.settings(env_id)
     needs_networks = _auxiliary_name(settings) == "sldr"
-    if not (imagine or needs_networks):
-        return settings
     if env_id in IDS:
-        return settings | known.object_settings(object_id(env_id))
+        alone = known.object_settings(object_id(env_id)) if imagine or needs_networks else {}
+        return settings | alone
     if needs_networks:
         raise ValueError(
             f"{env_id!r} is not a task of this package, whose observations alone SLDR's reward "
             "can read the object's state from; train it with --method fo or her"
         )
-    derived(env_id, report)  # refused here if its object cannot be followed
-    if _is_unknown(known, env_id):  # set up as the package's most similar task
-        if surface_choices(env_id)[0]:
-            settings = known.settings(SIMILAR[True])
-        _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
-    return settings | known.object_settings(object_id(SIMILAR[False]))
+    if imagine:
+        derived(env_id, report)  # refused here if its object cannot be followed
+    if _is_unknown(known, env_id):
+        settings = _similar_settings(known, env_id, imagine, report)
+    return settings | (known.object_settings(object_id(SIMILAR[False])) if imagine else {})
+
+
+def _similar_settings(known: ZooFile, env_id: str, imagine: bool, report: Report) -> dict[str, Any]:
+    """Return what a file says of the package's task that is most similar to one of others."""
+    try:
+        derived(env_id, report)
+    except ValueError:  # methods without imagined goals need not know the object
+        report(f"what moves in {env_id} is not known, so the settings are those of any task")
+        return known.settings(env_id)
+    on_surface = surface_choices(env_id)[0]
+    settings = known.settings(SIMILAR[True] if on_surface else env_id)
+    _scale_distances(settings, success_distance_of(env_id) / SUCCESS_DISTANCE)
+    reach = settings.get("reach")
+    # With imagined goals it depends on whether the object has learned to stay on its surface.
+    if on_surface and not imagine and reach is not None and reach.get("standoff") in (None, "auto"):
+        settings["reach"] = {**reach, "standoff": BEHIND}
+    return settings
 
 
 def method_of(settings: Mapping[str, Any], imagine: bool) -> str:

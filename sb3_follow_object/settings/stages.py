@@ -12,6 +12,8 @@ from .learning import AlgorithmSettings, InverseSettings, PredictorSettings
 
 COPIES, THREADS = 4096, 1024  # what is more would fill the memory
 
+BEHIND = 0.06  # metres, the standoff where objects are pushed
+
 
 @dataclass(frozen=True)
 class CurriculumSettings(Group):

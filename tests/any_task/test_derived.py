@@ -89,6 +89,20 @@ def test_updates_and_tests_follow_the_length_of_episodes() -> None:
     assert "n_updates" not in run_config(arm_and_wall.ARM).settings["reach"]
 
 
+@pytest.mark.parametrize(("env_id", "standoff"), [("Lifting-v0", None), (arm_and_wall.ARM, 0.06)])
+def test_methods_of_one_task_are_set_up_alike(env_id: str, standoff: float | None) -> None:
+    """Rivals have FO's budget and replay, and reach where FO's objects on a surface have it."""
+    fo, rher, her = (run_config(env_id, method=method) for method in ("fo", "rher", "her"))
+    assert fo.total_timesteps == rher.total_timesteps == her.total_timesteps
+    within = derived(env_id).success_distance
+    for run in (fo, rher, her):
+        replay = run.settings["algorithm"]["replay_buffer_kwargs"]
+        assert replay == fo.settings["algorithm"]["replay_buffer_kwargs"]
+        assert replay["moved_distance"] == replay["min_goal_distance"] == within
+    assert rher.settings["reach"].get("standoff") == standoff
+    assert her.settings.get("reach") is None
+
+
 def test_the_tutorials_task_is_found_out() -> None:
     found = derived(arm_and_wall.ARM)
     assert (found.object.name, found.horizon) == ("box", 50)

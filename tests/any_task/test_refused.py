@@ -13,6 +13,7 @@ from test_derived import Tidy
 
 from sb3_follow_object.any_task.derived import derived
 from sb3_follow_object.any_task.tasks import effector_seen_in
+from sb3_follow_object.settings.presets import run_config
 
 pytestmark = pytest.mark.usefixtures("few_resets")
 
@@ -386,3 +387,12 @@ def test_what_cannot_be_followed_is_refused_in_one_sentence(env_id: str, sentenc
 def test_an_error_is_told_in_one_sentence_where_only_the_effector_is_looked_for() -> None:
     with pytest.raises(ValueError, match="'Raises-v0' raised KeyError: 'open' while it was reset"):
         effector_seen_in("Raises-v0")
+
+
+def test_a_rival_where_nothing_can_be_followed_has_the_settings_of_any_task() -> None:
+    said: list[str] = []
+    run = run_config("NoPhysics-v0", method="rher", report=said.append)
+    assert said == [
+        "what moves in NoPhysics-v0 is not known, so the settings are those of any task"
+    ]
+    assert run.settings["algorithm"]["replay_buffer_kwargs"]["moved_distance"] == 0.05

@@ -16,11 +16,11 @@ from tiny_runs import bare_run
 
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
-from sb3_follow_object.reach.approach import BEHIND
 from sb3_follow_object.reach.vec_env import ReachFirstVecEnv
 from sb3_follow_object.runs import evaluation
 from sb3_follow_object.runs.checkpoints import checkpoint_files
 from sb3_follow_object.runs.experiment import train
+from sb3_follow_object.settings.stages import BEHIND
 
 REACH: dict[str, Any] = {"n_updates": 3, "batch_size": 16, "share": 0.7}
 PICK = "FollowObject/PnPSimpleV1-v0"

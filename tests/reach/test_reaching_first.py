@@ -23,10 +23,10 @@ from stable_baselines3.common.vec_env import (
 from sb3_follow_object.envs import make_vec
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
-from sb3_follow_object.reach.approach import BEHIND
 from sb3_follow_object.reach.vec_env import ReachFirstVecEnv
 from sb3_follow_object.reach.wrapper import ReachFirstWrapper
 from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
+from sb3_follow_object.settings.stages import BEHIND
 
 PUSH, PICK = "FollowObject/PushSideGap-v0", "FollowObject/PnPSimpleV1-v0"
 QUIET: dict[str, Any] = {**REACH, "noise": 0.0}
