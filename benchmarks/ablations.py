@@ -56,8 +56,9 @@ def read_row(run: Path) -> dict[str, Any]:
     result = {}
     if (run / "result.json").exists():
         result = json.loads((run / "result.json").read_text())
-    levels = config["settings"].get("curriculum", {}).get("n_levels", 25)
-    if config["settings"].get("curriculum", {}).get("levels") != "path":
+    curriculum = config["settings"].get("curriculum") or {}
+    levels = curriculum.get("n_levels", 25)
+    if curriculum.get("levels") != "path":
         levels = gym.spec(config["env_id"]).max_episode_steps or 50
     return {
         "task": config["env_id"].removeprefix("FollowObject/").removesuffix("-v0"),

@@ -266,8 +266,8 @@ def reaching_table(rows: list[Row]) -> str:
             after = reached(runs, "env_steps") if runs else None
             steps = f", 0.9 after {after:,.0f}" if after is not None else ""
             cells.append(f"{in_the_end(runs)}{steps}" if runs else "not run")
-        budget = median(float(row["env_steps"]) for row in found[task, "fo"])
-        lines.append((task, f"{budget:,.0f}", *cells))
+        of_fo = [float(row["env_steps"]) for row in of_task.get("fo", ())]
+        lines.append((task, f"{median(of_fo):,.0f}" if of_fo else "not run", *cells))
     return table(("task", "env steps of FO", *(NAMES[m] for m in COMPARED)), lines)
 
 
@@ -279,7 +279,7 @@ def robots_table(rows: list[Row]) -> str:
         if row["task"] not in TASKS:
             who = (row["task"], name_of(row["method"]), seeds([row]))
             figures = (*steps_and_minutes([row]), *end_and_cost([row]))
-            lines.append((*who, *figures, row["commit"][:7]))
+            lines.append((*who, *figures, (row["commit"] or "")[:7]))
     return table((*head, "at env steps", "and minutes", "commit"), lines)
 
 
@@ -300,7 +300,8 @@ def with_table(text: str, written: str) -> str:
 def read_rows() -> list[Row]:
     """Return all runs that are kept: this package's tasks first, in their order."""
     kept = [*RESULTS.glob("*/versions.json"), *OF_OTHERS.glob("*/versions.json")]
-    rows = [read_row(file.parent) for file in kept]
+    # Names that begin with a dot are of copies that were broken off.
+    rows = [read_row(file.parent) for file in kept if not file.parent.name.startswith(".")]
     tasks = ordered(TASKS, (row["task"] for row in rows))
     return sorted(rows, key=lambda row: (tasks.index(row["task"]), row["method"], row["seed"]))
 

@@ -42,7 +42,7 @@ COMMAND = shlex.join(["python", "benchmarks/paper_scale.py", *sys.argv[1:]])
 UPDATES_OF_ROBOT = "robot's updates"
 OBJECT = "object's policy", "object's paths and F_phi"
 PARTS: list[tuple[str, type, str]] = [
-    (OBJECT[0], ObjectStage, "learn_policy"),
+    (OBJECT[0], ObjectStage, "_train"),
     (OBJECT[1], ObjectStage, "learn_predictor"),
     ("robot's rollouts besides physics", HerDDPG, "collect_rollouts"),
     ("robot's physics", BatchedSimulation, "step"),

@@ -32,6 +32,15 @@ def _escaped(word: str) -> str:
     return "$'" + "".join(plain.get(byte, f"\\x{byte:02x}") for byte in os.fsencode(word)) + "'"
 
 
+def make_absolute(args: argparse.Namespace) -> None:
+    """Make paths those that they are now: making an environment may change the working folder."""
+    for name, value in vars(args).items():
+        if isinstance(value, Path):
+            setattr(args, name, value.absolute())
+        elif isinstance(value, list):
+            setattr(args, name, [v.absolute() if isinstance(v, Path) else v for v in value])
+
+
 def said_with_set(texts: Iterable[str]) -> dict[str, Any]:
     """Return the settings that --set gives.
 

@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Any
 from ..common.reports import Trouble, reason
 from ..settings.methods import check_methods
 from . import demo, export, picture, report
-from .arguments import check_agreed, overrides_of, policy_of, said_with_set, shell_line
+from .arguments import (
+    check_agreed,
+    make_absolute,
+    overrides_of,
+    policy_of,
+    said_with_set,
+    shell_line,
+)
 from .cli_options import PROGRAM, USER_ERROR, make_parser
 from .picture_names import CURVE, IMAGINED, TASK, VIDEO
 from .streams import leave_streams, open_streams
@@ -48,6 +55,7 @@ def _run(arguments: list[str]) -> int:
     args = argparse.Namespace(run_command=None)  # until it is read
     try:
         make_parser(_COMMANDS).parse_args(arguments, args)
+        make_absolute(args)
         args.command_line = shell_line([PROGRAM, *arguments])
         args.run_command(args)
     except (ValueError, OSError, RuntimeError, MemoryError, OverflowError) as error:
@@ -86,8 +94,7 @@ def _train(args: argparse.Namespace) -> None:
     from ..runs.progress import ProgressBar
     from ..runs.run_folder import CONFIG
 
-    # Where it is now: an environment that is made may change the working folder.
-    folder = args.run.absolute()
+    folder = args.run
     resume = args.resume or (args.resume_or_start and (folder / CONFIG).exists())
     config = _resumed_config(args) if resume else _config(args)
     with ProgressBar(config.total_timesteps, quiet=args.quiet) as bar:
@@ -173,22 +180,26 @@ def _config(args: argparse.Namespace) -> RunConfig:
 
 def _resumed_config(args: argparse.Namespace) -> RunConfig:
     """Return the folder's configuration; flags may repeat it and change only the steps."""
+    from ..envs.task_table import BUILT_IN
     from ..settings.presets import load_config
     from ..settings.stages import StageSettings
 
     config = load_config(args.run)
     if args.steps is not None:
         config = dataclasses.replace(config, total_timesteps=args.steps)
+    stages = config.settings
+    env = args.env and args.env.rpartition(":")[2]
     said = {
-        "env": (args.env, config.full_id),
-        "method": (args.method, config.method),
-        "seed": (args.seed, config.seed),
-        "n-envs": (args.n_envs, config.settings.get("n_envs", StageSettings.n_envs)),
-        "threads": (args.threads, config.torch_threads),
+        "env": (env if env in BUILT_IN else args.env, [config.full_id]),
+        "method": (args.method, [config.method]),
+        "seed": (args.seed, [config.seed]),
+        "n-envs": (args.n_envs, [stages.get("n_envs", StageSettings.n_envs)]),
+        # --set may have given one of the two numbers that the flag gives
+        "threads": (args.threads, [config.torch_threads, stages.get("n_threads")]),
     }
     for name, (given, kept) in said.items():
-        if given is not None and given != kept:
-            raise ValueError(f"the run in {args.run} has --{name} {kept}, not {given}")
+        if given is not None and given not in kept:
+            raise ValueError(f"the run in {args.run} has --{name} {kept[0]}, not {given}")
     if args.set or args.config or args.preset:
         args.env, args.method, args.seed = config.full_id, config.method, config.seed
         if not any(text.startswith("n_timesteps=") for text in args.set):
@@ -327,7 +338,7 @@ def _predictor(args: argparse.Namespace) -> None:
     from ..runs.predictor_cache import OF_OBJECT_STAGE, learn_predictor
 
     args.steps = args.n_envs = args.threads = None
-    folder = args.out.absolute()
+    folder = args.out
     config = _config(args)
     for text in args.set:
         if text.partition("=")[0].partition(".")[0] not in OF_OBJECT_STAGE:
@@ -341,7 +352,7 @@ def _predictor(args: argparse.Namespace) -> None:
         remove_half_written(folder)
         th.set_num_threads(1)
         learn_predictor(config, folder)
-    print(args.out)
+    print(folder)
 
 
 def _inspect(args: argparse.Namespace) -> None:

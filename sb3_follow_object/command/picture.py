@@ -27,7 +27,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Draw what is asked for and print its name."""
-    out = args.out or Path(args.what + _ENDINGS[args.what])
+    out = args.out or Path(args.what + _ENDINGS[args.what]).absolute()
     if out.suffix.lower() != _ENDINGS[args.what]:
         raise ValueError(f"{out} does not end in {_ENDINGS[args.what]}, which is what is written")
     if args.seed < 0:

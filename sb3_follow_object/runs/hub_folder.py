@@ -20,8 +20,9 @@ from ..ddpg.actor_files import load_actor
 from ..envs.robot_copies import robot_vec_env
 from ..settings.presets import load_config
 from ..settings.run_config import CONFIG, RunConfig
+from ..settings.stages import StageSettings
 from .evaluation import evaluate
-from .run_folder import POLICY, RESULT, VERSIONS, read_result
+from .run_folder import POLICY, RESULT, VERSIONS, noted_command, read_result
 
 # The names that SB3's users know from the hub.
 CARD, RESULTS, FILM = "README.md", "results.json", "replay.mp4"
@@ -82,6 +83,7 @@ def write_hub_folder(run: str | os.PathLike[str], folder: str | os.PathLike[str]
     check_new(folder)
     folder = folder.resolve()
     made = read_result(run) if (run / RESULT).exists() else {}
+    command = noted_command(run, str(made.get("command") or ""))
     files = {
         POLICY: _policy(run),
         CONFIG: json.dumps(asdict(config), indent=2).encode(),
@@ -96,7 +98,7 @@ def write_hub_folder(run: str | os.PathLike[str], folder: str | os.PathLike[str]
             atomic_write(new / name, content)
         results = _tested(new / POLICY, run / POLICY, config)
         atomic_write(new / RESULTS, json.dumps(results, indent=2).encode())
-        atomic_write(new / CARD, _card(made, config, results).encode())
+        atomic_write(new / CARD, _card(made.get("env_steps"), command, config, results).encode())
         _move(new, folder)
 
 
@@ -173,11 +175,12 @@ def check_new(folder: Path) -> None:
         raise ValueError(f"{folder} is not empty; give another folder")
 
 
-def _card(made: dict[str, Any], config: RunConfig, results: dict[str, Any]) -> str:
+def _card(steps: int | None, command: str, config: RunConfig, results: dict[str, Any]) -> str:
     """Return the model card: metadata that the hub reads, and a text.
 
     Args:
-        made: the run's result, empty before its end.
+        steps: env steps that the run took; None before its end.
+        command: that started it; empty if unknown.
         config: of the run.
         results: of the test for the hub.
     """
@@ -204,20 +207,25 @@ def _card(made: dict[str, Any], config: RunConfig, results: dict[str, Any]) -> s
             }
         ],
     }
-    steps = made.get("env_steps")
     text = _TEXT.format(
         method=config.method,
         env_id=config.env_id,
-        imagined=_IMAGINED if config.settings.get("imagine") else "",
+        imagined=_IMAGINED if config.settings.get("imagine", StageSettings.imagine) else "",
         success=results["success_rate"],
         episodes=results["n_eval_episodes"],
         env_steps="an unfinished training's" if steps is None else f"{steps:,}",
-        command=_without_folders(str(made.get("command") or ""))
-        or f"sb3-follow-object train --env {config.full_id}",
+        command=_without_folders(command) or _described(config),
         config=CONFIG,
         versions=VERSIONS,
     )
     return f"---\n{yaml.safe_dump(metadata, sort_keys=False)}---\n{text}"
+
+
+def _described(config: RunConfig) -> str:
+    """Return a command that trains as a run did, settings apart."""
+    words = ["sb3-follow-object", "train", "--env", config.full_id, "--method", config.method]
+    words += ["--seed", str(config.seed), "--steps", str(config.total_timesteps)]
+    return shlex.join(words)
 
 
 def _without_folders(command: str) -> str:

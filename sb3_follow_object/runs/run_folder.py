@@ -190,8 +190,10 @@ def read_result(folder: Path) -> dict[str, Any]:
         result = json.loads(path.read_text("utf-8"))
         for name, kind in _RESULT.items():
             result[name] = kind(result[name])
+        if not 0.0 <= result["success_rate"] <= 1.0:
+            raise ValueError(f"success_rate is {result['success_rate']}")
         return dict(result)
-    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+    except (OSError, KeyError, TypeError, ArithmeticError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not the result of a run ({error})") from error
 
 

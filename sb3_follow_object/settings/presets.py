@@ -194,8 +194,7 @@ def _similar_settings(known: ZooFile, env_id: str, imagine: bool, report: Report
     """Return what a file says of the package's task that is most similar to one of others."""
     try:
         derived(env_id, report)
-    except ValueError:  # methods without imagined goals need not know the object
-        report(f"what moves in {env_id} is not known, so the settings are those of any task")
+    except ValueError:  # nothing can be followed, which a method without imagined goals need not
         return known.settings(env_id)
     on_surface = surface_choices(env_id)[0]
     settings = known.settings(SIMILAR[True] if on_surface else env_id)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from sb3_follow_object.command import cli
-from sb3_follow_object.command.arguments import overrides_of, shell_line
+from sb3_follow_object.command.arguments import make_absolute, overrides_of, shell_line
 from sb3_follow_object.command.cli_options import make_parser
 from sb3_follow_object.settings.presets import run_config
 from sb3_follow_object.settings.run_config import RunConfig
@@ -58,6 +58,36 @@ def kept_run(folder: Path, config: RunConfig) -> Path:
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps(asdict(config)))
     return folder
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--env", f"sb3_follow_object:{TASK}"],
+        ["--env", TASK, "--threads", "2", "--set", "torch_threads=1"],
+        ["--env", TASK, "--threads", "2", "--set", "n_threads=1"],
+    ],
+    ids=["module before the id", "one thread of torch", "one thread of the simulation"],
+)
+def test_the_words_that_started_a_run_resume_it(words: list[str], tmp_path: Path) -> None:
+    args = parsed("--resume-or-start", *words)
+    config = cli._config(args)
+    args.run = kept_run(tmp_path / "run", config)
+    assert cli._resumed_config(args) == config
+    again = parsed("--resume", "--threads", "3")
+    again.run = args.run
+    with pytest.raises(ValueError, match="not 3"):
+        cli._resumed_config(again)
+
+
+def test_paths_stay_those_that_were_given_when_an_environment_changes_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    args = make_parser(cli._COMMANDS).parse_args(["plot", "a", "b/c", "--out", "curve.png"])
+    make_absolute(args)
+    assert args.runs == [tmp_path / "a", tmp_path / "b" / "c"]
+    assert args.out == tmp_path / "curve.png"
 
 
 def test_a_resumed_run_may_be_told_the_copies_that_it_has_by_default(tmp_path: Path) -> None:

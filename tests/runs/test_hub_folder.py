@@ -20,6 +20,7 @@ from sb3_follow_object.runs import hub_folder
 from sb3_follow_object.runs.hub_folder import load_hub_folder, write_hub_folder
 from sb3_follow_object.runs.run_folder import claim
 from sb3_follow_object.settings.presets import run_config
+from sb3_follow_object.settings.run_config import RunConfig
 
 TASK = "FollowObject/PushSideGap-v0"
 
@@ -66,6 +67,28 @@ def test_card_tells_the_hub_what_it_shows(hub: Path) -> None:
     assert found["mean_reward"].metric_value.startswith(f"{results['mean_reward']:.2f} +/- ")
     assert results["n_eval_episodes"] == 4
     assert "an unfinished training's env steps" in card.text
+
+
+def test_card_tells_what_trained_a_run_that_is_not_finished(copied: Path, tmp_path: Path) -> None:
+    """A command where one is noted; else one with what the command line needs no --set for."""
+    config = run_config(TASK, method="her", seed=7, overrides={"n_timesteps": 900})
+    (copied / "config.json").write_text(json.dumps(dataclasses.asdict(config)))
+    noted = "sb3-follow-object train --method her --set gamma=0.9"
+    cards = []
+    for command in (None, noted):
+        if command:
+            (copied / "command.txt").write_text(f"{command}\n")
+        write_hub_folder(copied, tmp_path / str(command))
+        cards.append((tmp_path / str(command) / "README.md").read_text())
+    assert f"train --env {TASK} --method her --seed 7 --steps 900\n" in cards[0]
+    assert f"\n{noted}\n" in cards[1]
+
+
+@pytest.mark.parametrize(("settings", "told"), [({}, True), ({"imagine": False}, False)])
+def test_card_says_whether_goals_were_imagined(settings: dict[str, Any], told: bool) -> None:
+    results = {"mean_reward": -1.0, "std_reward": 0.0, "success_rate": 0.5, "n_eval_episodes": 4}
+    card = hub_folder._card(None, "", RunConfig(TASK, "fo", settings=settings), results)
+    assert ("it is shown goals on the way" in card) == told
 
 
 def test_nothing_is_overwritten(made: Path, hub: Path) -> None:
