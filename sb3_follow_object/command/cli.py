@@ -189,7 +189,7 @@ def _resumed_config(args: argparse.Namespace) -> RunConfig:
         config = dataclasses.replace(config, total_timesteps=args.steps)
     stages = config.settings
     env = args.env and args.env.rpartition(":")[2]
-    said = {
+    said: dict[str, tuple[Any, list[Any]]] = {
         "env": (env if env in BUILT_IN else args.env, [config.full_id]),
         "method": (args.method, [config.method]),
         "seed": (args.seed, [config.seed]),

@@ -14,7 +14,7 @@ from ..runs.object_stage_files import OBJECT_STAGE
 from ..runs.run_folder import CONFIG, RESULT, claim
 from ..settings.presets import load_config
 from ..settings.run_config import RunConfig
-from ..settings.stages import StageSettings
+from ..settings.stages import CurriculumSettings, StageSettings
 
 OBJECT = "object"  # folder of the object stages that runs share
 # Settings that only runs with imagined goals read, and those that decide F_phi.
@@ -101,6 +101,12 @@ def unread(setting: str, config: RunConfig) -> str | None:
         return f"method {config.method!r} imagines no goals"
     if not begins and (first.startswith("object_") or first == "inverse_fit"):
         return f"method {config.method!r} has no object's stage"
+    curriculum = config.settings.get("curriculum") or {}
+    levels = curriculum.get("levels", CurriculumSettings.levels)
+    if setting == "curriculum.n_levels" and levels == "time":
+        return "with curriculum.levels=time there is a level for each time-step"
+    if setting == "solved_validations" and config.solved_at == 0.0:
+        return "with solved_at=0 no validation ends the run"
     return None
 
 

@@ -78,7 +78,7 @@ def read_cross_tests(run: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
             }
             for task, figures in content.items()
         }
-    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
+    except (OSError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not a file of cross tests ({error})") from error
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,10 @@ import numpy as np
 
 from ..common.extras import MissingExtra, need
 from ..envs import TASKS
-from ..runs.run_folder import EVALUATIONS
 from ..settings.methods import METHODS
 from ..settings.presets import read_config
 from .cross import PAIR, read_cross_tests
-from .plots import X_AXES, Curve, read_curve, save_png, spread
+from .plots import X_AXES, Curve, read_curve, save_png, spread, was_validated
 from .results import (
     FINISHED,
     UNFINISHED,
@@ -160,10 +159,11 @@ def _across_tasks(groups: Sequence[Group], methods: Sequence[str]) -> Any:
     """Return performance profiles and sample efficiency over the tasks that all methods ran."""
     figure, axes = _figure(1, 2)
     tasks, runs = common_runs(groups)
+    budgets = _budgets(runs)
     title = f"{', '.join(tasks)}\nseeds: {', '.join(f'{m} {len(s)}' for m, s in runs.items())}"
     try:
         profiles = performance_profiles({m: success_rates(s) for m, s in runs.items()}, _SHARES)
-        means = sample_efficiency({m: _success_over_time(s) for m, s in runs.items()})
+        means = sample_efficiency({m: _success_over_time(s, budgets) for m, s in runs.items()})
     except MissingExtra as error:
         title, profiles, means = str(error), {}, {}
     for axis, bands in zip(axes, (profiles, means), strict=True):
@@ -181,22 +181,29 @@ def _across_tasks(groups: Sequence[Group], methods: Sequence[str]) -> Any:
     return figure
 
 
-def _success_over_time(runs: Sequence[Sequence[Run]]) -> np.ndarray:
-    """Return success at shares of the runs' env steps, (seeds, tasks, n).
+def _budgets(runs: Mapping[str, Sequence[Sequence[Run]]]) -> list[int]:
+    """Return each task's env steps: the most that a run of any method was to have, in its order."""
+    seeds = [seed for of_method in runs.values() for seed in of_method]
+    steps = [[read_config(run.folder).total_timesteps for run in seed] for seed in seeds]
+    return [max(of_task) for of_task in zip(*steps, strict=True)]
 
-    A run that ended before its steps, because it was solved, keeps its last.
+
+def _success_over_time(runs: Sequence[Sequence[Run]], budgets: Sequence[int]) -> np.ndarray:
+    """Return success at shares of the tasks' env steps, (seeds, tasks, n).
+
+    A run that ended before them, because it was solved or was to have fewer, keeps its last.
     """
-    return np.array([[_success_of_budget(run) for run in seed] for seed in runs])
+    rows = [zip(seed, budgets, strict=True) for seed in runs]
+    return np.array([[_success_of_budget(run, budget) for run, budget in row] for row in rows])
 
 
-def _success_of_budget(run: Run) -> np.ndarray:
+def _success_of_budget(run: Run, budget: int) -> np.ndarray:
     assert run.env_steps is not None and run.success_rate is not None  # it has finished
     steps, success = np.array([]), np.array([])
-    if _was_validated(run):
+    if was_validated(run.folder):
         columns = read_curve(run.folder).columns
         steps, success = columns["env_steps"], columns["success_rate"]
     steps, success = np.append(steps, run.env_steps), np.append(success, run.success_rate)
-    budget = read_config(run.folder).total_timesteps
     return np.interp(_SHARES * budget, steps, success, left=0.0)
 
 
@@ -274,12 +281,7 @@ def _curve_panel(
 
 def _read_curves(group: Group, status: str) -> list[Curve]:
     """Return the curves of a group's runs of one status that were validated at least once."""
-    return [read_curve(run.folder) for run in group.of(status) if _was_validated(run)]
-
-
-def _was_validated(run: Run) -> bool:
-    path = run.folder / EVALUATIONS
-    return path.exists() and len(path.read_text("utf-8").splitlines()) > 1
+    return [read_curve(run.folder) for run in group.of(status) if was_validated(run.folder)]
 
 
 def _figure(rows: int, columns: int) -> tuple[Any, list[Any]]:

@@ -16,6 +16,8 @@ from ..common.suggestions import did_you_mean
 from ..envs import IDS, TASKS
 from ..envs.goal_envs import check_task
 from ..runs.run_folder import CONFIG, difference, task_label
+from ..settings.fields import settings_of
+from ..settings.learning import AuxiliarySettings
 from ..settings.methods import METHODS
 from ..settings.presets import load_config, run_config
 from ..settings.run_config import RunConfig
@@ -29,6 +31,8 @@ _SHARES = ("torch_threads", "settings.n_threads", "checkpoint_minutes")
 # The paper's epoch is 50 cycles of 38 episodes, after which 380 episodes are tested.
 _EPOCH_EPISODES, _PAPER_EPISODES = 1900, 380
 _TO_THE_END = {"solved_at": 0.0}  # methods are compared after equally many steps
+# Groups of settings that some methods have and that would make another method of the others.
+_MARKS = ("reach", "auxiliary", "replay_buffer_kwargs.cher")
 
 
 def plan(
@@ -63,7 +67,8 @@ def plan(
     for env_id in map(_env_id, tasks):  # one name is one task, with a module before its id or not
         ids.setdefault(task_label(env_id), env_id)
     _check_apart(ids, methods)
-    read = {(e, m): _read_by(e, m, settings) for e in ids.values() for m in methods}
+    of_some = _without_networks(settings, methods)
+    read = {(e, m): _read_by(e, m, of_some) for e in ids.values() for m in methods}
     for name in settings.overrides or {}:
         if not any(name in (its.overrides or {}) for its in read.values()):
             raise ValueError(f"--set {name} does nothing: none of {', '.join(methods)} reads it")
@@ -105,11 +110,48 @@ def _begins(task: str, method: str) -> str:
     return f"{file_name(task)}-{method}"
 
 
+def _without_networks(settings: Settings, methods: Sequence[str]) -> Settings:
+    """Return the settings without those of networks that only SLDR reads, where no method has it.
+
+    Where one has it the others keep them: they share the object's stage, which fits the networks.
+    """
+    if any("sldr" in method.split("-") for method in methods):
+        return settings
+    given = settings.overrides or {}
+    kept = {name: given[name] for name in given if name.partition(".")[0] != "inverse_fit"}
+    return replace(settings, overrides=kept)
+
+
 def _read_by(env_id: str, method: str, settings: Settings) -> Settings:
     """Return the settings without the overrides that a method does not read."""
-    config = _config(env_id, method, 0, settings, 1)
-    read = {n: v for n, v in (settings.overrides or {}).items() if unread(n, config) is None}
+    given = settings.overrides or {}
+    plain = {name: given[name] for name in given if name.rpartition(".")[0] not in _MARKS}
+    config = _config(env_id, method, 0, replace(settings, overrides=plain), 1)
+    own = {name: given[name] for name in given if name in plain or _has(config, name)}
+    if len(own) > len(plain):
+        config = _config(env_id, method, 0, replace(settings, overrides=own), 1)
+    read = {name: value for name, value in own.items() if unread(name, config) is None}
     return replace(settings, overrides=read)
+
+
+def _has(config: RunConfig, setting: str) -> bool:
+    """Whether a method has the group that a setting is in; given one, it would be another method.
+
+    Args:
+        config: of the method, without changes to such groups.
+        setting: its dotted name.
+    """
+    group, _, name = setting.rpartition(".")
+    if group == "reach":
+        return config.settings.get("reach") is not None
+    algorithm = config.settings.get("algorithm") or {}
+    if group == "replay_buffer_kwargs.cher":
+        return (algorithm.get("replay_buffer_kwargs") or {}).get("cher") is not None
+    reward = algorithm.get("auxiliary")
+    if reward is None:
+        return False
+    own, of_any = settings_of(AuxiliarySettings.of(reward)), settings_of(AuxiliarySettings.of({}))
+    return name in own or name not in of_any  # one that no reward has is refused by its name
 
 
 def _env_id(task: str) -> str:

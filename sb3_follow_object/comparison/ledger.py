@@ -14,6 +14,8 @@ from .cells import Cell, Settings
 GRID = "grid.json"
 ATTEMPTS = 2  # a run or a cross test that failed is taken up again once
 _FORMAT = 1
+# What reading a damaged grid file raises.
+_DAMAGE = (OSError, AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError)
 
 
 class Ledger:
@@ -93,14 +95,21 @@ def read_grid(folder: Path) -> dict[str, Any] | None:
         content = json.loads(path.read_text("utf-8"))
         if content["format"] != _FORMAT:
             raise ValueError(f"its format is {content['format']!r}, not {_FORMAT}")
-        for cell in content["cells"].values():
-            str(cell["task"]), str(cell["method"]), int(cell["seed"]), int(cell["failures"])
-            str(cell["error"])
-            if "cross" in cell:
-                int(cell["cross"]["failures"]), str(cell["cross"]["error"])
-    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
+        content["cells"] = {name: _entry(cell) for name, cell in content["cells"].items()}
+    except _DAMAGE as error:
         raise ValueError(f"{path} is not the file of a comparison's grid ({error})") from error
     return dict(content)
+
+
+def _entry(cell: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a cell's entry with each number as a number, however the file has it."""
+    named = {"task": str(cell["task"]), "method": str(cell["method"]), "seed": int(cell["seed"])}
+    crossed = {"cross": _failures(cell["cross"])} if "cross" in cell else {}
+    return {**named, **_failures(cell), **crossed}
+
+
+def _failures(counted: Mapping[str, Any]) -> dict[str, Any]:
+    return {"failures": int(counted["failures"]), "error": counted["error"]}
 
 
 def check_settings(folder: Path, settings: Settings) -> None:

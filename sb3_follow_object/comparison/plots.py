@@ -45,14 +45,11 @@ def read_curve(folder: str | os.PathLike[str]) -> Curve:
     """Read a run folder, of a finished run or of one that is still going on.
 
     Raises:
-        ValueError: it holds no run, or one without a validation so far.
+        ValueError: it holds no run, one without a validation so far, or a damaged file of them.
     """
     config = read_config(folder)
     path = Path(folder) / EVALUATIONS
-    rows: list[dict[str, str]] = []
-    if path.exists():
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+    rows = _read_rows(path)
     if not rows:
         raise ValueError(f"the run in {folder} has not been validated yet: nothing to plot")
     names = [*X_AXES, *(name for name in _Y if rows[0].get(name))]
@@ -61,6 +58,29 @@ def read_curve(folder: str | os.PathLike[str]) -> Curve:
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not a file of evaluations ({error})") from error
     return Curve(config.env_id, config.method, columns, decisive(config))
+
+
+def was_validated(folder: str | os.PathLike[str]) -> bool:
+    """Whether a run has been validated at least once, so that it has a curve.
+
+    Args:
+        folder: of the run, whether it exists or not.
+
+    Raises:
+        ValueError: the file of its validations is damaged.
+    """
+    return bool(_read_rows(Path(folder) / EVALUATIONS))
+
+
+def _read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a file of evaluations, none where there is no such file."""
+    if not path.exists():
+        return []
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except (csv.Error, ValueError) as error:  # a quote that never ends; bytes that are no text
+        raise ValueError(f"{path} is not a file of evaluations ({error})") from error
 
 
 def spread(curves: Sequence[Curve], x: str, y: str) -> tuple[np.ndarray, np.ndarray]:

@@ -19,7 +19,7 @@ from ..common.files import atomic_write
 from ..runs.run_folder import CONFIG, RESULT, VERSIONS, noted_command, read_result, task_label
 from ..settings.presets import read_config
 from ..settings.run_config import flat
-from .plots import Curve, read_curve, spread
+from .plots import Curve, read_curve, spread, was_validated
 from .results import FINISHED, Run, group_runs, ordered, read_results, table_rows
 
 _TEMPLATE = Path(__file__).parent / "report.html"
@@ -191,16 +191,14 @@ def _run_charts(curve: Curve) -> list[dict[str, Any]]:
 def _comparison_charts(runs: Sequence[Run], methods: Sequence[str]) -> list[dict[str, Any]]:
     """Return a chart for each task, with a line for each method that has been validated there."""
     charts = []
+    validated = [run for run in runs if is_run(run.folder) and was_validated(run.folder)]
     for group_task in dict.fromkeys(group.task for group in group_runs(runs)):
         series = []
         for number, method in enumerate(methods):
             curves, others = [], []
-            for run in runs:
-                if (run.task, run.method) == (group_task, method) and is_run(run.folder):
-                    try:
-                        curve = read_curve(run.folder)
-                    except ValueError:  # nothing has been validated: there is nothing to draw
-                        continue
+            for run in validated:
+                if (run.task, run.method) == (group_task, method):
+                    curve = read_curve(run.folder)
                     if run.status == FINISHED:
                         curves.append(curve)
                     else:

@@ -107,7 +107,7 @@ def read_results(folder: str | os.PathLike[str]) -> list[Run]:
     """Read a folder of run folders, and the runs that its grid file names beside them.
 
     Where runs of a task and method differ in more than their seed, their methods are told apart by
-    it, on all tasks. A run that two names lead to is one run.
+    what is not the preset's, on all tasks. A run that two names lead to is one run.
 
     Raises:
         ValueError: it holds no runs, two folders hold the same finished one, or a file of a run is
@@ -191,10 +191,12 @@ def common_runs(groups: Sequence[Group]) -> tuple[list[str], dict[str, list[list
 
     Returns:
         The tasks, and by method its finished runs, seed by seed one of each task: as many as it
-        has of all of these. Empty where no task is common to two or more methods.
+        has of all of these. Methods come in the groups' order. Empty where no task is common to
+        two or more of them.
     """
     finished = {(g.task, g.method): g.of(FINISHED) for g in groups if g.of(FINISHED)}
-    methods = list(dict.fromkeys(method for _, method in finished))
+    ran = {method for _, method in finished}
+    methods = [method for method in dict.fromkeys(g.method for g in groups) if method in ran]
     tasks = [
         task
         for task in dict.fromkeys(g.task for g in groups)

@@ -1,8 +1,8 @@
 """Statistics over seeds and tasks, with bootstrap intervals (Agarwal et al. 2021, by rliable).
 
 Scores are success rates in [0, 1], shape (seeds, tasks). Intervals are of 95%, from bootstrap
-samples that are stratified over tasks and the same whenever they are drawn. One seed has an
-interval of width 0, which says nothing.
+samples that are stratified over tasks and the same whenever they are drawn, whichever other methods
+there are. One seed has an interval of width 0, which says nothing.
 """
 
 from __future__ import annotations
@@ -113,13 +113,18 @@ def _bands(scores: Mapping[Key, Any], figure: Callable[..., Any]) -> dict[Key, n
     def figures(*given: np.ndarray) -> np.ndarray:
         return np.atleast_1d(figure(*given))
 
-    of_keys = {key: given if isinstance(given, list) else [given] for key, given in scores.items()}
-    points = {key: figures(*given) for key, given in of_keys.items()}
-    drawn = {key: scores[key] for key, given in of_keys.items() if max(map(len, given)) > 1}
+    bands: dict[Key, np.ndarray] = {}
     earlier = np.random.get_state()  # rliable draws from NumPy's global stream
-    np.random.seed(_SEED)
     try:
-        _, intervals = library.get_interval_estimates(drawn, figures, reps=_SAMPLES)
+        for key, given in scores.items():
+            arrays = given if isinstance(given, list) else [given]
+            at = figures(*arrays)
+            ends: Any = [at, at]
+            if max(map(len, arrays)) > 1:
+                np.random.seed(_SEED)  # anew for each, or its interval would hang on the others'
+                _, found = library.get_interval_estimates({key: given}, figures, reps=_SAMPLES)
+                ends = found[key]
+            bands[key] = np.vstack([at, ends])
     finally:
         np.random.set_state(earlier)
-    return {key: np.vstack([at, intervals.get(key, [at, at])]) for key, at in points.items()}
+    return bands

@@ -7,9 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..envs.task_table import BUILT_IN
 from ..runs.run_folder import CONFIG, RESULT, task_label
 from ..settings.fields import settings_of
-from ..settings.presets import read_config
+from ..settings.presets import PRESETS, read_config, run_config
 from ..settings.run_config import RunConfig, flat
 
 # A run's share of the machine and what is kept of it: they change no result.
@@ -73,16 +74,77 @@ def in_words(settings: Mapping[str, Any], names: Iterable[str]) -> str:
 def words_apart(configs: Mapping[Path, RunConfig]) -> dict[Path, str]:
     """Return in words, for each run, the settings in which runs of its method differ on a task.
 
-    What differs on one task is said on all of them, so that one choice of settings has one name.
+    What is the preset's own on a task goes without saying, so that one odd run does not rename the
+    others. What is said on one task is said on all of them where a run has the same value, so that
+    one choice of settings has one name.
     """
-    settings = {folder: decisive(config) for folder, config in configs.items()}
-    alike: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    of_methods: dict[str, dict[Path, RunConfig]] = {}
     for folder, config in configs.items():
-        alike.setdefault((config.method, config.env_id), []).append(settings[folder])
-    names: dict[str, dict[str, None]] = {}  # by method
-    for (method, _), group in alike.items():
-        names.setdefault(method, {}).update(dict.fromkeys(names_apart(group)))
+        of_methods.setdefault(config.method, {})[folder] = config
     return {
-        folder: in_words(settings[folder], names[config.method])
-        for folder, config in configs.items()
+        folder: words
+        for method, runs in of_methods.items()
+        for folder, words in _words_of_method(method, runs).items()
     }
+
+
+def _words_of_method(method: str, configs: Mapping[Path, RunConfig]) -> dict[Path, str]:
+    """Return `words_apart` of the runs of one method."""
+    settings = {folder: decisive(config) for folder, config in configs.items()}
+    tasks: dict[str, list[Path]] = {}
+    for folder, config in configs.items():
+        tasks.setdefault(config.env_id, []).append(folder)
+    apart = {task: names_apart([settings[run] for run in runs]) for task, runs in tasks.items()}
+    if not any(apart.values()):
+        return dict.fromkeys(configs, "")
+    usual = _usual_words(method, {task: [settings[f] for f in of] for task, of in tasks.items()})
+    unusual = {f: _words(settings[f]) - usual[config.env_id] for f, config in configs.items()}
+    said = dict.fromkeys(
+        word
+        for task, runs in tasks.items()
+        for name in apart[task]
+        for run in runs
+        if (word := in_words(settings[run], [name])) in unusual[run]
+    )
+    return {run: ", ".join(word for word in said if word in its) for run, its in unusual.items()}
+
+
+def _usual_words(
+    method: str, of_tasks: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> dict[str, set[str]]:
+    """Return by task what goes without saying of a method's runs: the words of its preset.
+
+    Args:
+        method: its name.
+        of_tasks: the settings of its runs by task. The preset is the one that they have most of; of
+            what a run has not got nothing is said, so there the preset's is no longer usual.
+    """
+    found: list[dict[str, set[str]]] = []
+    for preset in PRESETS:
+        words: dict[str, set[str]] = {}
+        for task, runs in of_tasks.items():
+            own = _preset_settings(task, method, preset)
+            words[task] = _words({n: own[n] for n in own if all(n in each for each in runs)})
+        found.append(words)
+
+    def shared(words: Mapping[str, set[str]]) -> int:
+        return sum(len(words[t] & _words(run)) for t, runs in of_tasks.items() for run in runs)
+
+    return max(found, key=shared)
+
+
+def _preset_settings(task: str, method: str, preset: str) -> dict[str, Any]:
+    """Return what a run of a preset hangs on, nothing where there is no such preset.
+
+    Nothing of tasks of others either: their presets cannot be told without importing them.
+    """
+    if task not in BUILT_IN:
+        return {}
+    try:
+        return decisive(run_config(task, method=method, preset=preset))
+    except ValueError:
+        return {}
+
+
+def _words(settings: Mapping[str, Any]) -> set[str]:
+    return {in_words(settings, [name]) for name in settings}

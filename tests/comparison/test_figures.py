@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from matplotlib.figure import Figure
-from result_folders import write_grid, write_run
+from result_folders import finish, write_grid, write_run
 
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.comparison import statistics
@@ -172,6 +172,19 @@ def test_methods_are_compared_across_tasks(tmp_path: Path, drawn: list[Figure]) 
     assert not her.any()
 
 
+def test_curves_of_unequal_lengths_share_one_axis(tmp_path: Path, drawn: list[Figure]) -> None:
+    for method, total, success in (("fo", 1000, 0.6), ("her", 2000, 0.8)):
+        path = write_run(tmp_path, "PnPShelf", method, 0, success) / "config.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "total_timesteps": total}))
+    (tmp_path / "PnPShelf-her-0" / "result.json").unlink()
+    finish(tmp_path / "PnPShelf-her-0", 0.8, env_steps=2000)
+    draw_results(tmp_path, tmp_path / "out", methods=("fo", "her"))
+    fo, her = (line.get_ydata() for line in drawn[4].axes[1].lines)
+    # Validated 0.1, 0.2 and 0.4 at 300, 600 and 900 env steps, of the 2,000 that are the task's.
+    assert (fo[15], fo[25], fo[-1]) == pytest.approx((0.2, 0.6, 0.6))
+    assert (her[15], her[-1]) == pytest.approx((0.2, 0.8))
+
+
 def test_methods_are_drawn_alone_where_two_of_them_ran(
     results: Path, drawn: list[Figure], tmp_path: Path
 ) -> None:
@@ -211,6 +224,7 @@ def test_cross_test_keeps_the_figure_and_refuses_what_cannot_be(
     assert read_cross_tests(run) == {"PnPSimpleV1": {"success_rate": 0.5, "episodes": 12}}
     with pytest.raises(ValueError, match="did you mean 'FollowObject/PnPSimpleV1-v0'"):
         cross_test(run, "FollowObject/PnPSimplV1-v0")
-    (run / CROSS_TESTS).write_text("[1]")
-    with pytest.raises(ValueError, match="is not a file of cross tests"):
-        read_cross_tests(run)
+    for damaged in ("[1]", "[" * 100_000):
+        (run / CROSS_TESTS).write_text(damaged)
+        with pytest.raises(ValueError, match="is not a file of cross tests"):
+            read_cross_tests(run)

@@ -22,7 +22,7 @@ from sb3_follow_object.comparison.cells import (
     stage_settings,
 )
 from sb3_follow_object.comparison.grid import plan
-from sb3_follow_object.comparison.ledger import Ledger, read_grid
+from sb3_follow_object.comparison.ledger import Ledger, given_up, read_grid
 from sb3_follow_object.runs.object_stage_files import OBJECT_STAGE
 from sb3_follow_object.runs.run_folder import CONFIG, RESULT, noted_command, task_label
 from sb3_follow_object.settings.methods import METHODS
@@ -122,26 +122,6 @@ def test_command_trains_the_same_run(tmp_path: Path) -> None:
     assert cell.config.n_eval_episodes == 380
     words = "--method fo --seed 4 --threads 1 --steps 1000 --set solved_at=0.0 eval_every=152000"
     assert f"{words} n_eval_episodes=380 curriculum.p=0.5" in cell.command
-
-
-def test_a_run_has_only_what_its_method_reads(tmp_path: Path) -> None:
-    overrides = {"curriculum.p": 0.5, "object_n_envs": 3, "n_paths": 64, "learning_starts": 500}
-    cells = plan(
-        tmp_path, ["PnPShelf"], ["fo", "sldr", "her"], [0], Settings(1000, overrides=overrides)
-    )
-    read = {
-        cell.method: [name for name in overrides if f"{name}=" in cell.command] for cell in cells
-    }
-    assert read == {
-        "fo": list(overrides),
-        "sldr": ["object_n_envs", "n_paths", "learning_starts"],
-        "her": ["learning_starts"],
-    }
-    for cell in cells:
-        arguments = make_parser(_COMMANDS).parse_args(shlex.split(cell.command)[1:])
-        assert _config(arguments) == cell.config
-    with pytest.raises(ValueError, match=r"curriculum.p does nothing: none of her, rnd reads it"):
-        plan(tmp_path, ["PnPShelf"], ["her", "rnd"], [0], Settings(1000, overrides=overrides))
 
 
 @pytest.mark.parametrize("name", ["eval_every", "n_eval_episodes"])
@@ -245,6 +225,27 @@ def test_damaged_grid_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "grid.json").write_text('{"format": 1, "cells": {"a": 3}}')
     with pytest.raises(ValueError, match="is not the file of a comparison's grid"):
         read_grid(tmp_path)
+
+
+@pytest.mark.parametrize("cells", ["[" * 100_000, '{"a": {"failures": Infinity}}'])
+def test_grid_file_that_cannot_be_taken_in_is_named(cells: str, tmp_path: Path) -> None:
+    place = '"task": "PnPShelf", "method": "her", "seed": 0, "error": null, '
+    cells = cells.replace('"failures"', f'{place}"failures"')
+    (tmp_path / "grid.json").write_text(f'{{"format": 1, "cells": {cells}}}')
+    with pytest.raises(ValueError, match=r"grid.json is not the file of a comparison's grid \("):
+        read_grid(tmp_path)
+
+
+def test_numbers_that_a_grid_file_has_as_text_are_numbers(tmp_path: Path) -> None:
+    failed = {"failures": "2", "error": "diverged"}
+    cell = {"task": "PnPShelf", "method": "her", "seed": "0", **failed, "cross": failed}
+    content = {"format": 1, "cells": {"PnPShelf-her-0": cell}}
+    (tmp_path / "grid.json").write_text(json.dumps(content))
+    grid = read_grid(tmp_path)
+    assert grid is not None
+    (entry,) = grid["cells"].values()
+    assert given_up(entry) and given_up(entry, cross=True)
+    assert entry["seed"] == 0 and entry["cross"] == {"failures": 2, "error": "diverged"}
 
 
 def test_grid_file_keeps_earlier_cells_and_failures(tmp_path: Path) -> None:

@@ -14,7 +14,13 @@ from result_folders import finish
 
 from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
 from sb3_follow_object.comparison import plots
-from sb3_follow_object.comparison.plots import by_settings, draw_curves, read_curve, spread
+from sb3_follow_object.comparison.plots import (
+    by_settings,
+    draw_curves,
+    read_curve,
+    spread,
+    was_validated,
+)
 from sb3_follow_object.runs.run_folder import CONFIG, EVALUATIONS
 from sb3_follow_object.settings.run_config import RunConfig
 
@@ -112,3 +118,14 @@ def test_folder_without_validations_is_refused(tmp_path: Path) -> None:
     (damaged / EVALUATIONS).write_text("env_steps,wall_s,success_rate\n1,2,many\n")
     with pytest.raises(ValueError, match="is not a file of evaluations"):
         read_curve(damaged)
+
+
+@pytest.mark.parametrize(
+    "damage", [b'"' + 200_000 * b"1", b"\xff\xfe1"], ids=["quote that never ends", "no text"]
+)
+def test_file_that_is_no_csv_is_named(damage: bytes, tmp_path: Path) -> None:
+    path = run_folder(tmp_path / "run", [0.1]) / EVALUATIONS
+    path.write_bytes(path.read_bytes() + damage)
+    for read in (read_curve, was_validated):
+        with pytest.raises(ValueError, match=r"evaluations.csv is not a file of evaluations \("):
+            read(tmp_path / "run")

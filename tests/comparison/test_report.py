@@ -117,6 +117,22 @@ def test_a_run_that_goes_on_has_a_line_of_its_own(tmp_path: Path) -> None:
     assert series["fo, seed 2 (unfinished)"]["points"] == [[1000, 0.0]]
 
 
+def test_run_without_validations_is_left_out_and_a_damaged_one_refused(tmp_path: Path) -> None:
+    make_run(tmp_path / "fo-0")
+    curve = make_run(tmp_path / "fo-1", seed=1) / "evaluations.csv"
+    for nothing in (HEAD, ""):
+        curve.write_text(nothing)
+        write_comparison_report(tmp_path, tmp_path / "report.html", {})
+        (line,) = charts(tmp_path / "report.html")["PushSideGap"]["series"]
+        assert line["name"] == "fo"
+    curve.unlink()
+    write_comparison_report(tmp_path, tmp_path / "report.html", {})
+    for damaged in (f"{HEAD}\n1000,1000,0,0,10,many,-9.5,4,2\n", f"{HEAD}\n1000\n"):
+        curve.write_text(damaged)
+        with pytest.raises(ValueError, match=r"fo-1.evaluations.csv is not a file of evaluations"):
+            write_comparison_report(tmp_path, tmp_path / "report.html", {})
+
+
 def test_names_cannot_end_the_script_that_holds_the_data(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     (run / "progress_0.csv").write_text("eval/env_steps,</script><b>\n1000,1.0\n")

@@ -200,6 +200,24 @@ def test_table_compares_each_method_with_the_first(tmp_path: Path) -> None:
     assert "| rnd | 1 | 0.95 | 1.00 |" in text, "an interval of one seed says nothing"
 
 
+def test_the_first_is_the_tables_first_column_whatever_is_finished(tmp_path: Path) -> None:
+    write_run(tmp_path, "PnPSimpleV1", "her", 0, 0.5)  # the first task, which fo has not finished
+    write_run(tmp_path, "PnPSimpleV1", "fo", 0)
+    for method, success in (("her", 0.1), ("fo", 0.9)):
+        write_run(tmp_path, "PnPShelf", method, 0, success)
+    write_run(tmp_path, "PnPShelf", "rnd", 0)
+    text = markdown_table(group_runs(read_results(tmp_path)))
+    assert "| task | fo | her | rnd |" in text
+    assert "| method | seeds | IQM | better than fo |" in text
+    assert text.index("| fo | 1 | 0.90 |  |") < text.index("| her | 1 | 0.10 | 0.00 |")
+
+
+def test_first_method_without_a_finished_run_is_not_compared_with(tmp_path: Path) -> None:
+    for method, success in (("fo", None), ("her", 0.1), ("rnd", 0.2)):
+        write_run(tmp_path, "PnPShelf", method, 0, success)
+    assert "| better than her |" in markdown_table(group_runs(read_results(tmp_path)))
+
+
 def test_tables_do_without_rliable(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(module: str) -> None:
         raise ModuleNotFoundError(module, name=module.split(".")[0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from rliable import metrics
@@ -58,3 +60,20 @@ def test_sample_efficiency_is_a_mean_at_each_time() -> None:
     middle, low, high = sample_efficiency({"fo": scores})["fo"]
     np.testing.assert_allclose(middle, [0.0, 0.3, 0.7])
     assert (low <= middle).all() and (high >= middle).all()
+
+
+@pytest.mark.parametrize(
+    "bands",
+    [
+        interquartile_means,
+        lambda scores: performance_profiles(scores, np.linspace(0.0, 1.0, 5)),
+        sample_efficiency,
+        lambda scores: probabilities_of_improvement({**scores, "base": np.eye(5)}, "base"),
+    ],
+)
+def test_interval_does_not_hang_on_which_other_methods_there_are(bands: Any) -> None:
+    random = np.random.default_rng(1)
+    scores = {name: random.random((5, 5)) for name in ("fo", "her", "rnd")}
+    alone = bands({"rnd": scores["rnd"]})["rnd"]
+    assert np.max(np.asarray(alone)[2] - np.asarray(alone)[1]) > 0.0
+    np.testing.assert_array_equal(bands(scores)["rnd"], alone)
