@@ -17,6 +17,7 @@ from ..callbacks.curriculum_callback import CurriculumCallback
 from ..callbacks.reach_callback import ReachCallback
 from ..common.numbers import checked_whole, shown
 from ..common.reports import Report
+from ..common.torch_helpers import threads_at
 from ..ddpg.actor_files import save_actor
 from ..ddpg.her_ddpg import HerDDPG
 from ..envs.goal_envs import known_id
@@ -228,10 +229,11 @@ class FollowObject:
             return self.model
         self.check()
         stage = self.object_stage
-        if self.imagine and stage.predictor is None:
-            stage.learn_predictor()
-        if stage.needs_networks and stage.networks is None:
-            stage.learn_policy()
+        with threads_at(1):
+            if self.imagine and stage.predictor is None:
+                stage.learn_predictor()
+            if stage.needs_networks and stage.networks is None:
+                stage.learn_policy()
         return self.robot_stage.begin(
             stage.predictor if self.imagine else None,
             stage.networks if stage.needs_networks else None,
@@ -243,17 +245,22 @@ class FollowObject:
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int | None = None,
+        tb_log_name: str = "FollowObject",
         progress_bar: bool = False,
     ) -> FollowObject:
         """Train until `env_steps` reaches `total_timesteps`; may be called again with more.
 
         The object's stage comes first and runs to its own end, however few `total_timesteps` are.
+        PyTorch has one thread meanwhile, which is fastest beside other work;
+        `algorithm={"update_threads": 2}` gives gradient steps more.
 
         Args:
-            total_timesteps: env steps in all, object stage and tests included.
+            total_timesteps: env steps in all, object stage, tests and earlier calls included.
             callback: of SB3, called while the robot trains.
-            log_interval: episodes between two log lines of SB3.
-            progress_bar: SB3's.
+            log_interval: episodes between two log lines of SB3; None, one a rollout where
+                `algorithm` has `verbose` or `tensorboard_log`.
+            tb_log_name: of the training in `tensorboard_log`, as SB3's.
+            progress_bar: SB3's, of the robot's training.
 
         Raises:
             ValueError: total_timesteps is no whole number of at least 0, log_interval none of at
@@ -270,11 +277,17 @@ class FollowObject:
         self.prepare()
         remaining = total_timesteps - self.env_steps
         if remaining > 0:
-            self.robot_stage.learn(remaining, callback, log_interval, progress_bar)
+            with threads_at(1):
+                self.robot_stage.learn(remaining, callback, log_interval, tb_log_name, progress_bar)
         elif self.env_steps == self.object_steps >= total_timesteps > 0:
             self.report(
                 f"the object's stage took {self.object_steps:,} env steps of {total_timesteps:,}: "
                 "none were left for the robot"
+            )
+        elif total_timesteps > 0:
+            self.report(
+                f"{self.env_steps:,} env steps are done already, of {total_timesteps:,} in all: "
+                "none are left"
             )
         return self
 

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from ..any_task.tasks import steps_of_object
 from ..callbacks.curriculum_callback import CurriculumCallback
 from ..callbacks.fresh_episodes import FreshEpisodes, begin_new_episodes
+from ..callbacks.progress_bar import WholeProgressBar
 from ..callbacks.reach_callback import ReachCallback
 from ..common.resuming import env_state, global_generators, set_env_state, set_global_generators
 from ..common.seeds import stream_seed
@@ -87,9 +88,16 @@ class RobotStage:
         return self.model
 
     def learn(
-        self, n_steps: int, callback: MaybeCallback, log_interval: int | None, progress_bar: bool
+        self,
+        n_steps: int,
+        callback: MaybeCallback,
+        log_interval: int | None,
+        tb_log_name: str,
+        progress_bar: bool,
     ) -> None:
         """Train for more env steps, those of the curriculum's tests included."""
+        model = self.model
+        assert model is not None
         callbacks: list[BaseCallback] = []
         if env_state(self.env) is None:
             testing = self.curriculum_callback
@@ -100,13 +108,18 @@ class RobotStage:
         for each in callback if isinstance(callback, list) else [callback]:
             if each is not None:
                 callbacks.append(each if isinstance(each, BaseCallback) else ConvertCallback(each))
-        assert self.model is not None
-        self.model.learn(
+        if progress_bar:
+            callbacks.append(WholeProgressBar())
+        shows = model.verbose > 0 or model.tensorboard_log is not None
+        if log_interval is None and shows and not model._custom_logger:
+            log_interval = self.env.num_envs
+        model.learn(
             n_steps,
             callback=callbacks,
             log_interval=log_interval,  # type: ignore[arg-type]
-            reset_num_timesteps=False,
-            progress_bar=progress_bar,
+            tb_log_name=tb_log_name,
+            # A training that goes on writes to the log that it has, a first one to its own.
+            reset_num_timesteps=model.num_timesteps == 0 and model._last_obs is None,
         )
 
     def state_dict(self, replay_buffer: bool = True) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from ..common.cache import CACHE_VARIABLE as CACHE_VARIABLE
 from ..common.cache import SET_THE_VARIABLE, cache_folder
 from ..common.files import lock
 from ..common.reports import Report
+from ..common.torch_helpers import threads_at
 from ..envs import IDS
 from ..envs.registration import import_task
 from ..follow_object.checks import check_object_stage
@@ -140,7 +141,8 @@ def learn_predictor(
     )
     try:
         check_object_stage(run.settings, run.horizon, needs_networks=False)
-        predictor = run.object_stage.learn_predictor(networks=True, keep=keep)
+        with threads_at(1):
+            predictor = run.object_stage.learn_predictor(networks=True, keep=keep)
     finally:
         run.close()
     networks = run.object_stage.networks
