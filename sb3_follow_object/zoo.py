@@ -26,10 +26,16 @@ COMMANDS = ("train", "enjoy", "record_video", "load_from_hub", "push_to_hub")
 PROGRAM = "python -m sb3_follow_object.zoo"
 USER_ERROR = 2
 
+_USAGE = f"""usage: {PROGRAM} COMMAND ...
+
+rl_zoo3 with {ALGORITHM} among its algorithms. COMMAND is one of {", ".join(COMMANDS)};
+COMMAND --help lists its options. See docs/rl_zoo3.md."""
 _NO_RECORD_TRAINING = (
     "record_training starts rl_zoo3.record_video, which does not know her_ddpg: give record_video "
     "with --load-checkpoint for each model"
 )
+_OF_LOAD = "_init_setup_model"  # an argument that SB3's load() gives
+_NO_SETTINGS = ("self", "env", _OF_LOAD)
 _PARTS = {
     "policy_kwargs": ("net_arch", "critic_layer_norm"),
     "replay_buffer_kwargs": ("n_sampled_goal", "moved_ratio"),
@@ -54,7 +60,8 @@ class ZooHerDDPG(HerDDPG):
 
     def __init__(self, policy: Any, env: Any, **settings: Any):
         settings = _nested(settings)
-        check_names(settings, inspect.signature(HerDDPG.__init__).parameters, "HerDDPG")
+        known = [n for n in inspect.signature(HerDDPG.__init__).parameters if n not in _NO_SETTINGS]
+        check_names({n: v for n, v in settings.items() if n != _OF_LOAD}, known, "HerDDPG")
         super().__init__(policy, env, **settings)
 
     def learn(
@@ -254,6 +261,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the command and rl_zoo3's arguments; by default the process's.
     """
     command, *arguments = (sys.argv[1:] if argv is None else argv) or [""]
+    if command in ("-h", "--help"):
+        print(_USAGE)
+        return 0
     try:
         if command == "record_training":
             raise ValueError(_NO_RECORD_TRAINING)

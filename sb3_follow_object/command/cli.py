@@ -375,9 +375,9 @@ def _inspect(args: argparse.Namespace) -> None:
 
 
 def _settings(args: argparse.Namespace) -> None:
-    from ..settings.table import lines
+    from ..settings.docs_tables import lines_with_preset
 
-    print(*lines(args.name), sep="\n")
+    print(*lines_with_preset(args.name), sep="\n")
 
 
 def _print_table(row: dict[str, Any]) -> None:

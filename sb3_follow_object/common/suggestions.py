@@ -5,9 +5,21 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+_MOST = 60  # names in a sentence; gymnasium knows hundreds of ids
+_ALIKE = 0.6  # difflib's ratio, below which two words have little more than letters in common
+# Settings that are known for a sentence of their own alone, which refuses them.
+_REFUSED = {"features_extractor_class", "features_extractor_kwargs"}
+
 
 def did_you_mean(word: str, known: Iterable[object]) -> str:
-    """The end of a sentence about an unknown name: the nearest known one, else all of them."""
-    names = [str(name) for name in known]
-    near = difflib.get_close_matches(str(word), names, n=1, cutoff=0.4)
-    return f"; did you mean {near[0]!r}?" if near else f"; known are {', '.join(names)}"
+    """The end of a sentence about an unknown name: the nearest known one, else all of them.
+
+    An environment's id is found without its namespace, too.
+    """
+    names = [name for name in dict.fromkeys(map(str, known)) if name not in _REFUSED]
+    whole = {name.rpartition("/")[2]: name for name in names} | {name: name for name in names}
+    near = difflib.get_close_matches(str(word), whole, n=1, cutoff=_ALIKE)
+    if near:
+        return f"; did you mean {whole[near[0]]!r}?"
+    more = f" and {len(names) - _MOST} more" if len(names) > _MOST else ""
+    return f"; known are {', '.join(names[:_MOST])}{more}"

@@ -45,9 +45,13 @@ class GoalPolicy(WholeModule, MultiInputPolicy):
         target_clip: tuple[float, float] | None = GoalPolicySettings.target_clip,
         **kwargs: Any,
     ):
-        for name, whose in (("use_sde", "DDPG's and TD3's"), ("mirrors", "without mirrors")):
-            if name in kwargs:
-                raise ValueError(f"GoalPolicy is {whose}: leave {name} out")
+        if "use_sde" in kwargs:  # which SAC and TQC give every policy
+            raise ValueError(
+                "GoalPolicy is for DDPG and TD3, which know no use_sde: with SAC and TQC take "
+                '"MultiInputPolicy" and policy_kwargs={"activation_fn": LayerNormReLU}'
+            )
+        if "mirrors" in kwargs:
+            raise ValueError("GoalPolicy is without mirrors: leave mirrors out")
         settings = GoalPolicySettings(action_l2=action_l2, target_clip=target_clip)
         self.action_l2 = settings.action_l2
         self.target_clip = settings.target_clip

@@ -148,7 +148,8 @@ class HerPolicy(WholeModule, TD3Policy):
         mirrors: planes over which the environment is symmetric, as `Mirror` or its fields: the
             networks see every state on one side of them. Beyond the paper.
 
-    The other arguments are TD3Policy's.
+    The other arguments are TD3Policy's, but for the features extractor's class and arguments, which
+    are HerPolicy's own; `HerDDPG` refuses share_features_extractor in its policy_kwargs, too.
 
     Raises:
         ValueError: an invalid argument; or, by `predict`, another algorithm than `HerDDPG` has

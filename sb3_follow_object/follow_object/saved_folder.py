@@ -18,10 +18,11 @@ from ..envs.goal_envs import known_id
 from ..imagination.goal_predictor import GoalPredictor
 from ..object_stage.networks import FILE as OBJECT_NETWORKS
 from ..object_stage.networks import ObjectNetworks
+from ..settings.presets import SAVED_STATE
 from ..settings.run_config import CONFIG
 
 _FACE = "environment"
-_SETTINGS, _PREDICTOR, _STATE = "settings.json", "predictor", "state.safetensors"
+_SETTINGS, _PREDICTOR = "settings.json", "predictor"
 
 
 @dataclass
@@ -62,7 +63,7 @@ def write(folder: Path, saved: Saved) -> None:
         saved.object_networks.save(folder / OBJECT_NETWORKS)
     else:
         (folder / OBJECT_NETWORKS).unlink(missing_ok=True)
-    save_tree(folder / _STATE, saved.state)
+    save_tree(folder / SAVED_STATE, saved.state)
     atomic_write(folder / _SETTINGS, settings)
 
 
@@ -86,7 +87,7 @@ def read(folder: Path) -> Saved:
     if (folder / OBJECT_NETWORKS).exists():
         networks = ObjectNetworks.load(folder / OBJECT_NETWORKS, env_id=env_id)
     face = settings.pop(_FACE, None)
-    return Saved(settings, predictor, networks, load_tree(folder / _STATE), face)
+    return Saved(settings, predictor, networks, load_tree(folder / SAVED_STATE), face)
 
 
 def face_of(env_id: str) -> dict[str, Any]:

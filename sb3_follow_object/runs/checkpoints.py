@@ -70,13 +70,17 @@ class Checkpoints(NoCopies):
 
         Args:
             env_steps: of the run so far; names the file.
-            tree: as `save_tree` takes it.
+            tree: as `save_tree` takes it; its "stage" says whose steps they are.
         """
         self.wait()
         started = time.perf_counter()
         snapshot = self._camera.take(tree)
         stalled = time.perf_counter() - started
-        self._thread = threading.Thread(target=self._write, args=(env_steps, snapshot, stalled))
+        # The object's are of its training alone, as its tests are told, without F_phi's paths.
+        whose = " of the object's training" if tree.get("stage") == "object" else ""
+        self._thread = threading.Thread(
+            target=self._write, args=(env_steps, whose, snapshot, stalled)
+        )
         self._thread.start()
 
     def poll(self) -> None:
@@ -99,20 +103,20 @@ class Checkpoints(NoCopies):
         for path in files[:-1] if keep_last else files:
             path.unlink()
 
-    def _write(self, env_steps: int, snapshot: Snapshot, stalled: float) -> None:
+    def _write(self, env_steps: int, whose: str, snapshot: Snapshot, stalled: float) -> None:
         try:
             path = self.folder / CHECKPOINTS.replace("*", f"{env_steps:012}")
             size = snapshot.write(path)
             self._drop_old(path)
             self._outcome = (
-                f"checkpoint at {env_steps} env steps: {size / 1e6:.1f} MB, "
+                f"checkpoint at {env_steps} env steps{whose}: {size / 1e6:.1f} MB, "
                 f"training stood still for {stalled:.2f} s"
             )
         except Exception as error:  # nobody else would hear of it
             kept = checkpoint_files(self.folder)
             rest = f"the last good one is {kept[-1].name}" if kept else "there is no other so far"
             self._outcome = Trouble(
-                f"the checkpoint at {env_steps} env steps could not be written "
+                f"the checkpoint at {env_steps} env steps{whose} could not be written "
                 f"({reason(error)}); {rest}"
             )
 

@@ -91,14 +91,16 @@ class ProgressBar(NoCopies):
     def update(self, figures: dict[str, Any]) -> None:
         """Show the figures that `train` reports after each rollout."""
         now, steps = time.monotonic(), figures["env_steps"]
-        if self._first is None:
+        speed = ""
+        if self._first is None:  # one figure has no speed
             self._first = (now, steps)
-        since, first_steps = self._first
-        speed = (steps - first_steps) / (now - since) if now > since else 0.0
+        elif now > self._first[0]:
+            since, first_steps = self._first
+            speed = f"  {(steps - first_steps) / (now - since):,.0f} steps/s"
         rate, k_max = figures["success_rate"], figures["k_max"]
         text = "success " + ("-" if rate is None else f"{rate:.2f}")
         text += "" if k_max is None else f"  k_max {k_max}"
-        text += f"  {speed:,.0f} steps/s"
+        text += speed
         self._bar.update(self._task, completed=min(steps, self._total), figures=text)
         if not self._console.is_terminal and now - self._last_line >= _LINE_EVERY:
             self._last_line = now

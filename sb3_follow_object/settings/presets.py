@@ -37,6 +37,7 @@ from .table import check_dotted
 from .zoo_yaml import SIMILAR, WRAPPER, ZooFile, of_data, with_numbers
 
 PRESETS = ("default", "paper")
+SAVED_STATE = "state.safetensors"  # what FollowObject.save writes, and a run's folder has not
 # Settings in metres that are meant as shares of the distance within which goals are reached.
 _TOLERANCES = (
     ("curriculum", "min_distance"),
@@ -240,9 +241,21 @@ def read_config(folder: str | os.PathLike[str]) -> RunConfig:
         saved = json.loads(path.read_text("utf-8"))
         return RunConfig(**{**saved, "settings": saved["settings"]})  # without, it is none
     except FileNotFoundError as error:
-        raise ValueError(f"{folder} holds no run: there is no {path}") from error
+        raise ValueError(f"{folder} holds no run: {_instead(path)}") from error
+    except NotADirectoryError as error:
+        raise ValueError(f"{folder} is no folder of a run: {_instead(path)}") from error
     except (OSError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not the configuration of a run ({error})") from error
+
+
+def _instead(path: Path) -> str:
+    """Say what there is in place of a run's configuration, and what reads it."""
+    folder = path.parent
+    if (folder / SAVED_STATE).exists():
+        return "a FollowObject was saved there, which FollowObject.load reads"
+    if folder.is_file() and folder.suffix == ".zip":
+        return "it is a saved model, which HerDDPG.load reads, or the class that saved it"
+    return "it is a file" if folder.is_file() else f"there is no {path}"
 
 
 def load_config(folder: str | os.PathLike[str]) -> RunConfig:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from ..common.suggestions import did_you_mean
 from .fields import Group, Setting, settings_of
@@ -38,6 +38,16 @@ GROUPS: dict[type[Group], str] = {
     InverseSettings: "inverse_fit.",
 }
 
+# What config.json and Python have and data has not, and what says it there.
+_OTHERWISE = {
+    "total_timesteps": "say n_timesteps, or --steps",
+    "seed": "say --seed",
+    "env_id": "say --env",
+    "method": "say --method",
+    "algorithm": "say what it holds alone, e.g. noise_std for algorithm.noise_std",
+    "settings": "say what it holds alone, e.g. n_envs for settings.n_envs",
+}
+
 
 def listed(group: type[Group]) -> list[Setting]:
     """Return what data can say of a group, without what a group before it says already."""
@@ -63,11 +73,12 @@ def default(each: Setting) -> str:
     return json.dumps(each.default).strip('"')
 
 
-def lines(name: str | None = None) -> list[str]:
+def lines(name: str | None = None, preset: Mapping[str, str] | None = None) -> list[str]:
     """Return what there is to say of every setting, or of those with this name or below it.
 
     Args:
         name: dotted, as --set takes it, e.g. "curriculum" or "curriculum.p".
+        preset: what to say of a preset's values, by dotted names, where they are not the defaults.
 
     Raises:
         ValueError: there is none of that name, with the nearest that there is.
@@ -75,16 +86,20 @@ def lines(name: str | None = None) -> list[str]:
     found = by_name()
     wanted = found if name is None else _below(found, name)
     if not wanted:
-        meant = _nested(str(name)) or did_you_mean(str(name), found)
+        first = str(name).partition(".")[0]
+        meant = _otherwise(first) or _nested(str(name)) or did_you_mean(str(name), found)
         raise ValueError(f"there is no setting {name!r}{meant}")
+    said = preset or {}
     return [
-        f"{dotted}: {values(each)}, default {default(each)}; {each.sentence}"
+        f"{dotted}: {values(each)}, default {default(each)}"
+        + (f", {said[dotted]}" if said.get(dotted, "") else "")
+        + f"; {each.sentence}"
         for dotted, each in wanted.items()
     ]
 
 
 def check_dotted(names: Iterable[str], where: str) -> None:
-    """Raise a ValueError for a name that a setting has in its group alone.
+    """Raise a ValueError for a name that a setting has in its group alone, or elsewhere.
 
     Args:
         names: that stand for themselves, without their group's.
@@ -92,8 +107,13 @@ def check_dotted(names: Iterable[str], where: str) -> None:
     """
     known = by_name()
     for name in names:
-        if name not in known and (meant := _nested(name)):
+        if name not in known and (meant := _otherwise(name) or _nested(name)):
             raise ValueError(f"{where} has no setting {name!r}{meant}")
+
+
+def _otherwise(name: str) -> str:
+    """The end of a sentence about a name that something else than data has; "" of others."""
+    return f"; {_OTHERWISE[name]}" if name in _OTHERWISE else ""
 
 
 def _nested(name: str) -> str:

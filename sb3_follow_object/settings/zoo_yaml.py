@@ -12,6 +12,7 @@ from ..envs.task_table import BUILT_IN
 from .fields import Group, Setting, check_names, settings_of
 from .run_config import RunConfig
 from .stages import ReachFirstSettings, ReachTeachingSettings, StageSettings, part_of_reach
+from .table import check_dotted
 
 # The package's task that one of one's own is set up as, by whether its object is pushed.
 SIMILAR = {True: "FollowObject/PushSideGap-v0", False: "FollowObject/PnPSimpleV2-v0"}
@@ -24,6 +25,8 @@ REACH_CALLBACK = "sb3_follow_object.ReachCallback"
 _KNOWN = {"env_wrapper": (WRAPPER, REACH_WRAPPER), "callback": (CALLBACK, REACH_CALLBACK)}
 # The callback's keyword arguments, and what FollowObject calls them.
 _CALLBACK_NAMES = {"every": "test_every", "n_episodes": "n_test_episodes", "store": "store_tests"}
+# Settings of stock algorithms, and rl_zoo3's for them, that runs have not.
+_OF_STOCK = ("normalize", "noise_type", "replay_buffer_class", "ent_coef", "use_sde")
 
 
 class ZooFile:
@@ -55,6 +58,12 @@ class ZooFile:
         The arguments of its wrappers, callbacks and environments are settings like the others.
         """
         settings = with_numbers(self._entry(env_id))
+        if stock := [name for name in _OF_STOCK if name in settings]:
+            raise ValueError(
+                f"{self.path} has {stock[0]!r}, as a file for one of rl_zoo3's stock algorithms: "
+                "train it by `python -m rl_zoo3.train` (docs/rl_zoo3.md)"
+            )
+        check_dotted(settings, str(self.path))
         wrappers = self._classes(settings, "env_wrapper")
         callbacks = self._classes(settings, "callback")
         if WRAPPER in wrappers:

@@ -15,7 +15,7 @@ import yaml
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.object_stage.stage import ObjectStage
 from sb3_follow_object.runs.stages import RunStages
-from sb3_follow_object.settings.presets import run_config
+from sb3_follow_object.settings.presets import SAVED_STATE, run_config
 
 TASK = "FollowObject/PushSideGap-v0"
 CASES = yaml.safe_load(Path(__file__).with_name("bad_inputs.yaml").read_text())
@@ -34,6 +34,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").write_text("{" if name == "BADCONFIG" else config)
     (tmp_path / "ENDED" / "result.json").write_text("{}")
+    (tmp_path / "SAVED").mkdir()
+    (tmp_path / "SAVED" / SAVED_STATE).touch()
+    (tmp_path / "MODEL.zip").touch()
     (tmp_path / "BADPOLICY" / "policy.safetensors").write_bytes(bytes(100))
     monkeypatch.chdir(tmp_path)
 

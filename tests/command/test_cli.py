@@ -25,7 +25,8 @@ from sb3_follow_object.common.files import LOCK, lock
 from sb3_follow_object.common.reports import Trouble
 from sb3_follow_object.envs import physics_id
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
-from sb3_follow_object.runs import predictor_cache
+from sb3_follow_object.runs import predictor_cache, progress
+from sb3_follow_object.runs.checkpoints import Checkpoints
 from sb3_follow_object.runs.predictor_cache import (
     CACHE_VARIABLE,
     OF_OBJECT_STAGE,
@@ -344,6 +345,29 @@ def test_quiet_does_not_hide_trouble(capsys: pytest.CaptureFixture[str]) -> None
     terminal.say(Trouble("the disk is full"))
     printed = capsys.readouterr()
     assert (printed.out, printed.err) == ("", "the disk is full\n")
+
+
+def test_the_speed_is_told_from_the_second_figure_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter((0.0, 100.0, 200.0))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    bar, told = ProgressBar(10_000, quiet=True), list[str]()
+    monkeypatch.setattr(bar, "say", told.append)
+    for steps in (1000, 3000):
+        bar.update({"env_steps": steps, "success_rate": None, "k_max": 2})
+    assert told == [
+        "1,000/10,000 steps  success -  k_max 2",
+        "3,000/10,000 steps  success -  k_max 2  20 steps/s",
+    ]
+
+
+def test_a_checkpoint_says_whose_steps_it_counts(tmp_path: Path) -> None:
+    told: list[str] = []
+    checkpoints = Checkpoints(tmp_path, 2, told.append)
+    for steps, stage in ((16016, "object"), (25616, "robot")):
+        checkpoints.write(steps, {"stage": stage})
+    checkpoints.wait()
+    assert told[0].startswith("checkpoint at 16016 env steps of the object's training: ")
+    assert told[1].startswith("checkpoint at 25616 env steps: ")
 
 
 def test_a_reader_who_has_gone_is_an_error_like_others() -> None:

@@ -14,7 +14,13 @@ from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from tiny import TASK
 
-from sb3_follow_object import FollowObjectReplayBuffer, GoalPolicy, HerDDPG, HerPolicy
+from sb3_follow_object import (
+    FollowObjectReplayBuffer,
+    GoalPolicy,
+    HerDDPG,
+    HerPolicy,
+    LayerNormReLU,
+)
 from sb3_follow_object.ddpg.layer_norm import LayerNorm
 from sb3_follow_object.envs import make_vec
 
@@ -148,10 +154,18 @@ def test_what_cannot_be_meant_is_refused(settings: dict[str, Any], sentence: str
 
 def test_each_policy_is_refused_by_algorithms_that_it_is_not_for() -> None:
     env = make_vec(TASK, 1, 1)
-    with pytest.raises(ValueError, match="GoalPolicy is DDPG's and TD3's: leave use_sde out"):
+    with pytest.raises(
+        ValueError, match=r"GoalPolicy is for DDPG and TD3, .*: with SAC and TQC take"
+    ):
         SAC(GoalPolicy, env, buffer_size=100)
+    of_sac = {"activation_fn": LayerNormReLU}  # what the sentence says to take
+    SAC("MultiInputPolicy", env, buffer_size=100, policy_kwargs=of_sac)
     with pytest.raises(ValueError, match="HerDDPG wants a HerPolicy, not GoalPolicy"):
         HerDDPG(GoalPolicy, env, buffer_size=100)  # type: ignore[arg-type]
+    shared = {"share_features_extractor": True}
+    with pytest.raises(ValueError, match="'share_features_extractor'; known are net_arch") as error:
+        HerDDPG("MultiInputPolicy", env, buffer_size=100, policy_kwargs=shared)
+    assert "features_extractor_class" not in str(error.value)  # which is refused, too
     model = DDPG(HerPolicy, env, buffer_size=1000, learning_starts=100, batch_size=8)
     model.predict(env.reset())  # nothing is learned yet
     with pytest.raises(ValueError, match="HerPolicy is HerDDPG's alone"):

@@ -314,3 +314,20 @@ def test_trials_that_are_never_evaluated_are_pruned_with_the_reason(
 def test_record_training_is_told_what_to_take_instead(capsys: pytest.CaptureFixture[str]) -> None:
     zoo_exits(2, "record_training")
     assert "record_video with --load-checkpoint" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("word", ["-h", "--help"])
+def test_help_is_usage(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    zoo_exits(0, word)
+    said = capsys.readouterr()
+    assert said.out.startswith("usage: python -m sb3_follow_object.zoo COMMAND")
+    assert all(command in said.out for command in zoo.COMMANDS) and not said.err
+
+
+def test_names_that_are_no_settings_are_not_among_the_known() -> None:
+    with pytest.raises(
+        ValueError, match="HerDDPG has no setting 'foo'; known are policy, "
+    ) as error:
+        zoo.ZooHerDDPG("MultiInputPolicy", gym.make(TASK), foo=1)
+    known = str(error.value).split("known are ")[1].split(", ")
+    assert "noise_std" in known and not {"self", "env", "_init_setup_model"} & {*known}

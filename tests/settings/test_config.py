@@ -47,6 +47,15 @@ def test_stock_algorithms_have_files_too(algorithm: str) -> None:
         run_config(TASK, method=algorithm)
 
 
+@pytest.mark.parametrize("algorithm", STOCK)
+def test_a_file_for_stock_algorithms_says_what_trains_it(algorithm: str) -> None:
+    file = preset_file(algorithm)
+    with pytest.raises(ValueError) as refusal:
+        run_config(TASK, file=file)
+    sentence = "as a file for one of rl_zoo3's stock algorithms: train it by `python -m rl_zoo3"
+    assert str(refusal.value).startswith(f"{file} has 'normalize', {sentence}.train`")
+
+
 @pytest.mark.parametrize(
     ("names", "sentence"),
     [

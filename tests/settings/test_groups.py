@@ -34,7 +34,7 @@ from sb3_follow_object.replay.cher import GoalSelection
 from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
 from sb3_follow_object.runs.experiment import train
 from sb3_follow_object.settings import presets
-from sb3_follow_object.settings.docs_tables import with_tables
+from sb3_follow_object.settings.docs_tables import lines_with_preset, with_tables
 from sb3_follow_object.settings.fields import Group, Setting, settings_of
 from sb3_follow_object.settings.learning import (
     AlgorithmSettings,
@@ -207,6 +207,20 @@ def test_the_command_names_every_setting_with_range_and_default() -> None:
     assert lines("object_algorithm.tau")[0].startswith("object_algorithm.tau: number (0, 1]")
     names = {line.split(":")[0] for line in lines()}
     assert {"n_timesteps", "batch_size", "auxiliary.max_bonus", "curriculum.k_max"} <= names
+
+
+def test_the_command_says_what_the_default_preset_has_instead() -> None:
+    said = {line.split(":")[0]: line for line in lines_with_preset()}
+    assert said.keys() == {line.split(":")[0] for line in lines()}
+    assert "default 0.25, fo's preset 0.15; success rate" in said["curriculum.threshold"]
+    steps = run_config("FollowObject/PnPShelf-v0").total_timesteps
+    assert f"fo's preset {steps} on PnPShelf, by task;" in said["n_timesteps"]
+    of_one_task = "default 0.0, fo's preset 0.05 on PnPInsertion, by task;"
+    assert of_one_task in said["replay_buffer_kwargs.scene_distance"]
+    assert "fo's" not in said["curriculum.p"]
+    (of_object,) = lines_with_preset("object_algorithm.gradient_steps")
+    assert "default 40, fo's preset 120; updates" in of_object
+    assert not any("fo's" in line for line in lines_with_preset("object_algorithm.tau"))
 
 
 @pytest.mark.parametrize(
