@@ -331,8 +331,6 @@ def _compare(args: argparse.Namespace) -> None:
 
 
 def _predictor(args: argparse.Namespace) -> None:
-    import torch as th
-
     from ..common.files import lock, remove_half_written
     from ..runs.hub_folder import check_new
     from ..runs.predictor_cache import OF_OBJECT_STAGE, learn_predictor
@@ -350,7 +348,6 @@ def _predictor(args: argparse.Namespace) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with lock(folder, wait=False):
         remove_half_written(folder)
-        th.set_num_threads(1)
         learn_predictor(config, folder)
     print(folder)
 

@@ -7,8 +7,6 @@ from collections.abc import Iterable
 
 _MOST = 60  # names in a sentence; gymnasium knows hundreds of ids
 _ALIKE = 0.6  # difflib's ratio, below which two words have little more than letters in common
-# Settings that are known for a sentence of their own alone, which refuses them.
-_REFUSED = {"features_extractor_class", "features_extractor_kwargs"}
 
 
 def did_you_mean(word: str, known: Iterable[object]) -> str:
@@ -16,7 +14,7 @@ def did_you_mean(word: str, known: Iterable[object]) -> str:
 
     An environment's id is found without its namespace, too.
     """
-    names = [name for name in dict.fromkeys(map(str, known)) if name not in _REFUSED]
+    names = list(dict.fromkeys(map(str, known)))
     whole = {name.rpartition("/")[2]: name for name in names} | {name: name for name in names}
     near = difflib.get_close_matches(str(word), whole, n=1, cutoff=_ALIKE)
     if near:

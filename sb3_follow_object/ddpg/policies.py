@@ -23,6 +23,8 @@ from .layer_norm import LayerNorm
 
 one_thread_after_forks()
 
+# What TD3Policy takes and HerPolicy brings its own of.
+_BROUGHT = ("features_extractor_class", "features_extractor_kwargs")
 _KERNELS = {"fused", "foreach", "differentiable"}  # of Adam's, one of them at a time
 
 
@@ -169,10 +171,11 @@ class HerPolicy(WholeModule, TD3Policy):
         mirrors: Sequence[Mirror | Mapping[str, Any]] | None = None,
         **kwargs: Any,
     ):
-        if "features_extractor_class" in kwargs:
-            raise ValueError(
-                "HerPolicy brings its own features extractor; leave features_extractor_class out"
-            )
+        for brought in _BROUGHT:
+            if brought in kwargs:
+                raise ValueError(
+                    f"HerPolicy brings its own features extractor; leave {brought} out"
+                )
         self.critic_layer_norm = critic_layer_norm
         self.features_clip = features_clip
         with usual_defaults():
@@ -190,7 +193,7 @@ class HerPolicy(WholeModule, TD3Policy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         """What `save` writes beside the weights, for `load` to build the policy from."""
         arguments = super()._get_constructor_parameters()
-        for brought in ("features_extractor_class", "features_extractor_kwargs"):
+        for brought in _BROUGHT:
             del arguments[brought]
         own = {
             "critic_layer_norm": self.critic_layer_norm,

@@ -195,10 +195,6 @@ class PolicySettings(Group):
     optimizer_class: Annotated[
         PythonClass | None, setting("of actor and critics", none="Adam", data=False)
     ] = None
-    features_extractor_class: Annotated[Any, setting("HerPolicy brings its own", data=False)] = None
-    features_extractor_kwargs: Annotated[Any, setting("HerPolicy brings its own", data=False)] = (
-        None
-    )
 
 
 @dataclass(frozen=True)

@@ -109,20 +109,28 @@ class Buttons(Tidy):
         self.action_space = gym.spaces.Discrete(3)  # type: ignore[assignment]
 
 
-PUCK = """
+def beside_a_finger(bodies: str, gravity: float = -9.81) -> str:
+    """A scene of these bodies and a finger that turns where it touches nothing."""
+    return f"""
 <mujoco>
+  <option gravity="0 0 {gravity}"/>
   <worldbody>
-    <body name="finger" pos="0 0 0.3">
+    <body name="finger" pos="0 0 0.6">
       <joint name="turn" axis="0 0 1"/><geom size="0.02" mass="0.1"/><site name="tip"/>
     </body>
-    <body name="puck">
-      <joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
-      <geom size="0.02" mass="0.1"/>
-    </body>
+    {bodies}
   </worldbody>
   <actuator><position joint="turn"/></actuator>
 </mujoco>
 """
+
+
+PUCK = beside_a_finger("""
+    <body name="puck">
+      <joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+      <geom size="0.02" mass="0.1"/>
+    </body>
+""")
 
 
 class EndsOnSlides(EndsThere):
@@ -141,36 +149,22 @@ class EndsOnSlides(EndsThere):
         return self._observation(), {}
 
 
-PARTED = """
-<mujoco>
-  <worldbody>
-    <body name="finger" pos="0 0 0.3">
-      <joint name="turn" axis="0 0 1"/><geom size="0.02" mass="0.1"/><site name="tip"/>
-    </body>
+PARTED = beside_a_finger("""
     <body name="sledge">
       <joint name="x" type="slide" axis="1 0 0"/><geom size="0.01" mass="0.1"/>
       <body name="puck" pos="0 0 0.1">
         <joint name="y" type="slide" axis="0 1 0"/><geom size="0.02" mass="0.1"/>
       </body>
     </body>
-  </worldbody>
-  <actuator><position joint="turn"/></actuator>
-</mujoco>
-"""
-BALLS = """
-<mujoco>
-  <option gravity="0 0 0"/>
-  <worldbody>
-    <body name="finger" pos="0 0 0.6">
-      <joint name="turn" axis="0 0 1"/><geom size="0.02" mass="0.1"/><site name="tip"/>
-    </body>
+""")
+BALLS = beside_a_finger(
+    """
     <body name="pole">
       <joint name="ball" type="ball"/><geom size="0.02" pos="0.2 0 0" mass="0.1"/>
     </body>
-  </worldbody>
-  <actuator><position joint="turn"/></actuator>
-</mujoco>
-"""
+""",
+    gravity=0.0,
+)
 
 
 class EndsOnParents(EndsOnSlides):

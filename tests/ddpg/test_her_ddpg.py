@@ -331,7 +331,10 @@ def test_environment_without_goals_is_refused() -> None:
         ({"target_update_interval": 0}, "target_update_interval is 0"),
         ({"average_decay": 1.0}, "average_decay is 1.0"),
         ({"matmul_precision": "low"}, "matmul_precision must be .*, not 'low'"),
-        ({"policy_kwargs": {"features_extractor_class": object}}, "leave features_extractor"),
+        (
+            {"policy_kwargs": {"features_extractor_class": object}},
+            "policy_kwargs has no setting .features_extractor_class.; known are",
+        ),
         ({"target_clip": "wide"}, "target_clip must be .*, not 'wide'"),
         ({"target_clip": [0.0, -1.0]}, "target_clip must be .low, high."),
         ({"target_clip": [0.0]}, "target_clip must be .low, high."),

@@ -78,7 +78,6 @@ def test_each_training_has_a_folder_of_its_own_in_tensorboard(
 def test_the_progress_bar_ends_where_the_training_does(
     predictor: GoalPredictor, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("rich")
     run = imagining(predictor, {})
     run.learn(400)
     before = run.env_steps

@@ -1,4 +1,4 @@
-"""What may have been meant: near names alone, and none that would be refused in its turn."""
+"""What may have been meant: near names alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ OF_AN_ENVIRONMENT = ("env_id", "make_env", "object", "goal", "is_success", "effe
         ("objet", OF_AN_ENVIRONMENT, "; did you mean 'object'?"),
         ("steps", ("n_timesteps", "tau"), "; did you mean 'n_timesteps'?"),
         ("PnPShelv", ("FollowObject/PnPShelf-v0",), "; did you mean 'FollowObject/PnPShelf-v0'?"),
-        ("share_features_extractor", ("features_extractor_class", "tau"), "; known are tau"),
         ("?", map(str, range(100)), "57, 58, 59 and 40 more"),
     ],
 )
