@@ -18,6 +18,7 @@ from ..envs import IDS
 from ..envs.goal_space import goal_space
 from ..envs.registration import import_task
 from ..envs.robot_copies import robot_maker
+from ..envs.task_table import BUILT_IN
 from ..imagination.goal_predictor import GoalPredictor
 from ..replay.steps import check_actions
 from ..runs.predictor_cache import kept_predictor
@@ -44,7 +45,8 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
     """
     name = import_task(env_id)
     if name in IDS:
-        raise ValueError(f"{name!r} is a task of this package; inspect is for those of others")
+        source = "this package" if name in BUILT_IN else "register_task"
+        raise ValueError(f"{name!r} is a task of {source}; inspect is for those of others")
     found = derived(name, report)
     _check_actions(name)
     return {

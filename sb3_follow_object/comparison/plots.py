@@ -74,13 +74,24 @@ def was_validated(folder: str | os.PathLike[str]) -> bool:
 
 def _read_rows(path: Path) -> list[dict[str, str]]:
     """Return the rows of a file of evaluations, none where there is no such file."""
-    if not path.exists():
-        return []
+    return read_rows(path, "file of evaluations") if path.exists() else []
+
+
+def read_rows(path: Path, kind: str) -> list[dict[str, str]]:
+    """Return the rows of a CSV file.
+
+    Args:
+        path: of the file.
+        kind: what it should be, for the error.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
     try:
         with open(path, newline="", encoding="utf-8") as file:
             return list(csv.DictReader(file))
     except (csv.Error, ValueError) as error:  # a quote that never ends; bytes that are no text
-        raise ValueError(f"{path} is not a file of evaluations ({error})") from error
+        raise ValueError(f"{path} is not a {kind} ({error})") from error
 
 
 def spread(curves: Sequence[Curve], x: str, y: str) -> tuple[np.ndarray, np.ndarray]:

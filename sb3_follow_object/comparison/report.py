@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import html
 import json
 import os
@@ -19,7 +18,7 @@ from ..common.files import atomic_write
 from ..runs.run_folder import CONFIG, RESULT, VERSIONS, noted_command, read_result, task_label
 from ..settings.presets import read_config
 from ..settings.run_config import flat
-from .plots import Curve, read_curve, spread, was_validated
+from .plots import Curve, read_curve, read_rows, spread, was_validated
 from .results import FINISHED, Run, group_runs, ordered, read_results, table_rows
 
 _TEMPLATE = Path(__file__).parent / "report.html"
@@ -108,7 +107,8 @@ def write_run_report(
         pictures: PNG and MP4 files by their titles.
 
     Raises:
-        ValueError: the folder holds no run, or one that has not been validated yet.
+        ValueError: the folder holds no run, or one that has not been validated yet, or a file of
+            it is damaged.
     """
     folder, page = Path(folder), _Page()
     config, curve = read_config(folder), read_curve(folder)
@@ -223,15 +223,14 @@ def _logged_charts(folder: Path) -> list[dict[str, Any]]:
     """Return a chart for each column of SB3's logs, which each resumption begins anew."""
     columns: dict[str, list[tuple[float, float]]] = {}
     for path in sorted(folder.glob("progress_*.csv"), key=lambda path: path.stat().st_mtime):
-        with open(path, newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                for name, text in row.items():
-                    try:
-                        point = (float(row["eval/env_steps"]), float(text))
-                    except (KeyError, TypeError, ValueError):  # empty, or no number
-                        continue
-                    if np.isfinite(point).all() and name != "eval/env_steps":
-                        columns.setdefault(name, []).append(point)
+        for row in read_rows(path, "file of logged values"):
+            for name, text in row.items():
+                try:
+                    point = (float(row["eval/env_steps"]), float(text))
+                except (KeyError, TypeError, ValueError):  # empty, or no number
+                    continue
+                if np.isfinite(point).all() and name != "eval/env_steps":
+                    columns.setdefault(name, []).append(point)
     charts = []
     for name, points in sorted(columns.items()):
         steps, values = np.array(points).T

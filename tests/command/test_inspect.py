@@ -144,7 +144,8 @@ def test_what_the_picture_lacks_is_told_before_anything_is_looked_at(
     ("env_id", "sentence"),
     [
         ("FetchReach-v4", "'FetchReach-v4': the achieved goal is a point of the robot itself"),
-        ("FollowObject/PnPShelf-v0", "'FollowObject/PnPShelf-v0' is a task of this package"),
+        ("FollowObject/PnPShelf-v0", "'FollowObject/PnPShelf-v0' is a task of this package;"),
+        ("own_tasks:FollowObject/PushPast-v0", "is a task of register_task; inspect is for those"),
         ("Nowhere-v0", "there is no environment 'Nowhere-v0'"),
         ("nowhere:Arm-v0", "names a module that cannot be imported"),
     ],

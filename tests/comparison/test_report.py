@@ -133,6 +133,13 @@ def test_run_without_validations_is_left_out_and_a_damaged_one_refused(tmp_path:
             write_comparison_report(tmp_path, tmp_path / "report.html", {})
 
 
+def test_a_damaged_log_is_named(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    (run / "progress_0.csv").write_bytes(b"eval/env_steps,x\n1000,\xff\xfe\n")
+    with pytest.raises(ValueError, match=r"progress_0\.csv is not a file of logged values"):
+        write_run_report(run, tmp_path / "report.html", {})
+
+
 def test_names_cannot_end_the_script_that_holds_the_data(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     (run / "progress_0.csv").write_text("eval/env_steps,</script><b>\n1000,1.0\n")
