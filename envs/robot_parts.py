@@ -13,7 +13,8 @@ def robot_bodies(model: mujoco.MjModel) -> np.ndarray:
     """Whether each body belongs to a robot, bool (nbody,).
 
     A robot is what hangs on the first joint of a chain that an actuator drives, or a mocap body
-    that pulls. Such mocap bodies belong to it; joints without an actuator do not make a robot.
+    that pulls. Such mocap bodies belong to it, those too that the model has switched off, as
+    suction is; joints without an actuator do not make a robot.
     """
     robot = np.zeros(model.nbody, dtype=bool)
     for body in _driven(model):
@@ -22,9 +23,16 @@ def robot_bodies(model: mujoco.MjModel) -> np.ndarray:
             robot[root] = True
     for body in range(1, model.nbody):  # parents come before their children
         robot[body] |= robot[model.body_parentid[body]]
-    for mocap, _ in _pulled(model):
+    for mocap, _, _ in pulled(model):
         robot[mocap] = True
     return robot
+
+
+def robot_roots(model: mujoco.MjModel) -> list[int]:
+    """The robot's bodies that hang on nothing of it."""
+    robot = robot_bodies(model)
+    roots = np.flatnonzero(robot & ~robot[model.body_parentid])
+    return [int(body) for body in roots]
 
 
 def first_jointed(model: mujoco.MjModel, body: int) -> int:
@@ -72,7 +80,7 @@ def touching_geoms(model: mujoco.MjModel) -> np.ndarray:
 def _driven(model: mujoco.MjModel) -> set[int]:
     """Bodies that an actuator or a pulling mocap body moves."""
     kinds = mujoco.mjtTrn
-    driven: set[int] = {pulled for _, pulled in _pulled(model)}
+    driven = {body for _, body, row in pulled(model) if model.eq_active0[row]}
     for kind, target in zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True):
         kind = int(kind)
         if kind in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
@@ -99,18 +107,26 @@ def tendon_bodies(model: mujoco.MjModel, tendon: int) -> set[int]:
     return bodies
 
 
-def _pulled(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Pairs of a mocap body and the body that it is welded or connected to."""
-    pairs = []
-    for kind, objects, first, second in zip(
-        model.eq_type, model.eq_objtype, model.eq_obj1id, model.eq_obj2id, strict=True
-    ):
-        if int(kind) not in map(int, _PULLS):
+def pulled(model: mujoco.MjModel) -> list[tuple[int, int, int]]:
+    """Mocap bodies, the body that each is welded or connected to, and the equality that does it."""
+    found = []
+    for row in range(model.neq):
+        if int(model.eq_type[row]) not in map(int, _PULLS):
             continue
-        bodies = [int(first), int(second)]
-        if int(objects) == int(mujoco.mjtObj.mjOBJ_SITE):
-            bodies = [int(model.site_bodyid[site]) for site in bodies]
-        for mocap, pulled in (bodies, bodies[::-1]):
-            if model.body_mocapid[mocap] >= 0 and pulled:
-                pairs.append((mocap, pulled))
-    return pairs
+        bodies = equated_bodies(model, row)
+        for mocap, body in (bodies, bodies[::-1]):
+            if model.body_mocapid[mocap] >= 0 and body:
+                found.append((mocap, body, row))
+    return found
+
+
+def equated_bodies(model: mujoco.MjModel, row: int) -> list[int]:
+    """The bodies that an equality is about, two of bodies or sites, one or two of joints."""
+    things = [int(model.eq_obj1id[row]), int(model.eq_obj2id[row])]
+    kind = int(model.eq_type[row])
+    if kind == int(mujoco.mjtEq.mjEQ_JOINT):
+        return [int(model.jnt_bodyid[joint]) for joint in things if joint >= 0]
+    if kind not in map(int, _PULLS):
+        return []
+    of_sites = int(model.eq_objtype[row]) == int(mujoco.mjtObj.mjOBJ_SITE)
+    return [int(model.site_bodyid[each]) for each in things] if of_sites else things

@@ -17,6 +17,7 @@ from .robot_parts import body_name, carrier, robot_bodies, tendon_bodies, touchi
 # What makes a tendon more than a thing that is measured.
 _ACTS = ("stiffness", "damping", "frictionloss", "limited", "armature")
 JOINT_SIZE = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # of mjtJoint: positions, velocities
+_OFF = mujoco.mjtDisableBit
 _EQUALITIES = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_JOINT)
 
 
@@ -58,12 +59,17 @@ def transcribe(
             they become mocap bodies, so that all copies can share one model.
 
     Raises:
-        ValueError: it has deformable things, geoms that a plugin shapes, or tendons that pull at
-            nothing but passive bodies.
+        ValueError: it has deformable things, geoms that a plugin shapes, tendons that pull at
+            nothing but passive bodies, or no constraints.
     """
     if model.nflex:
         raise ValueError(
             "the scene has deformable parts, which the object's own scene cannot have yet"
+        )
+    if model.opt.disableflags & int(_OFF.mjDSBL_CONSTRAINT):
+        raise ValueError(
+            "the scene's options disable constraints, and with them contacts, which the object's "
+            "own scene cannot do without"
         )
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -78,10 +84,11 @@ def transcribe(
         added = _add_body(model, data, int(body), varying, copied)
         first = int(model.body_geomadr[body])
         for geom in range(first, first + int(model.body_geomnum[body])):
-            if touching[geom]:
+            if touching[geom] or model.geom_fluid[geom, 0]:
                 _add_geom(model, geom, added, spec, meshes)
     _add_contact_rules(model, copied)
-    _add_equalities(model, copied)
+    if not model.opt.disableflags & int(_OFF.mjDSBL_EQUALITY):
+        _add_equalities(model, data, copied)
     return copied
 
 
@@ -115,8 +122,7 @@ def _copy_options(model: mujoco.MjModel, spec: mujoco.MjSpec) -> None:
         else:
             setattr(spec.option, name, value)
     # The object is pulled by a weld, whatever the scene itself does without.
-    off = mujoco.mjtDisableBit
-    spec.option.disableflags &= ~(int(off.mjDSBL_EQUALITY) | int(off.mjDSBL_CONSTRAINT))
+    spec.option.disableflags &= ~int(_OFF.mjDSBL_EQUALITY)
 
 
 def _add_body(
@@ -228,6 +234,8 @@ def _add_geom(
         group=int(model.geom_group[geom]),
         rgba=model.geom_rgba[geom],
     )
+    added.fluid_ellipsoid = model.geom_fluid[geom, 0]
+    added.fluid_coefs[:] = model.geom_fluid[geom, 1:6]
     shape = int(model.geom_dataid[geom])
     if kind == kinds.mjGEOM_MESH:
         added.meshname = _mesh(model, shape, spec, meshes)
@@ -314,8 +322,8 @@ def _add_contact_rules(model: mujoco.MjModel, copied: Transcription) -> None:
             copied.spec.add_exclude(bodyname1=names[0], bodyname2=names[1])
 
 
-def _add_equalities(model: mujoco.MjModel, copied: Transcription) -> None:
-    """Equalities between kept bodies, sites of theirs or joints."""
+def _add_equalities(model: mujoco.MjModel, data: mujoco.MjData, copied: Transcription) -> None:
+    """Equalities between kept bodies, sites of theirs or joints, as `data` has them on or off."""
     for row in range(model.neq):
         kind = mujoco.mjtEq(int(model.eq_type[row]))
         if kind not in _EQUALITIES:
@@ -332,7 +340,7 @@ def _add_equalities(model: mujoco.MjModel, copied: Transcription) -> None:
             objtype=mujoco.mjtObj(int(model.eq_objtype[row])),
             name1=names[0],
             name2="" if alone else names[1],
-            active=bool(model.eq_active0[row]),
+            active=bool(data.eq_active[row]),
             solref=model.eq_solref[row],
             solimp=model.eq_solimp[row],
         )

@@ -11,6 +11,7 @@ import numpy as np
 from ..common.answers import one_each
 from ..envs.goal_envs import success_method
 from ..envs.physics_engine import mujoco
+from ..envs.transcription import JOINT_SIZE
 from .finding import Candidate
 from .physics_access import physics_of
 
@@ -50,22 +51,35 @@ def success_distance(env: gym.Env, goals: np.ndarray) -> float:
     return nearest
 
 
-def ends_at_goal(env: gym.Env, found: Candidate, horizon: int) -> bool:
-    """Whether an episode ends once the object is put on its goal, as near as it can be.
+def check_goes_on(env: gym.Env, found: Candidate, horizon: int) -> None:
+    """Raise a ValueError where an episode ends early, one at random or with the object at its goal.
 
     Args:
-        env: is reset and stepped.
+        env: is reset and stepped, for two whole episodes.
         found: the object.
         horizon: T, after which every episode ends.
     """
-    obs, _ = env.reset(seed=0)
-    model, data = physics_of(env)
-    goal = np.array(obs["desired_goal"], np.float64)
+    for held, how in ((True, "with the object on its goal"), (False, "of random actions")):
+        obs, _ = env.reset(seed=0)
+        goal = np.array(obs["desired_goal"], np.float64)
+        for step in range(1, horizon):
+            action = env.action_space.sample()
+            if held:
+                action = np.zeros_like(action)
+                _hold(*physics_of(env), found, goal)
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                raise ValueError(
+                    f"an episode {how} ended after {step} of {horizon} steps; imagined goals need "
+                    "episodes that go on to their time limit: turn that off in the environment"
+                )
+
+
+def _hold(model: mujoco.MjModel, data: mujoco.MjData, found: Candidate, goal: np.ndarray) -> None:
+    """Put the object on a goal (3,), as near as it can be, at rest."""
     for joint in _joints_of(model, found.body) * _ROUNDS:
         _bring(model, data, joint, found, goal)
     mujoco.mj_forward(model, data)
-    _, _, terminated, truncated, _ = env.step(np.zeros_like(env.action_space.sample()))
-    return bool(terminated or (truncated and horizon > 1))
 
 
 def _joints_of(model: mujoco.MjModel, body: int) -> list[int]:
@@ -83,7 +97,8 @@ def _bring(
 ) -> None:
     """Move one of an object's joints to where the object is nearest to a goal (3,)."""
     place, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
-    kinds = mujoco.mjtJoint
+    kinds, speed = mujoco.mjtJoint, int(model.jnt_dofadr[joint])
+    data.qvel[speed : speed + JOINT_SIZE[kind][1]] = 0.0
     mujoco.mj_kinematics(model, data)
     point = _point(data, found)
     if kind == int(kinds.mjJNT_FREE):

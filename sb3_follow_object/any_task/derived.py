@@ -23,15 +23,16 @@ from ..envs.physics_engine import mujoco
 from ..envs.registration import import_task, registration_key
 from ..envs.robot_copies import robot_maker
 from ..envs.robot_face import RobotTask, rewards_on_and_off
-from ..envs.robot_parts import body_name
+from ..envs.robot_parts import body_name, robot_roots
 from ..envs.robotics import check_robotics
-from .at_goal import ends_at_goal, success_distance
+from .at_goal import check_goes_on, success_distance
 from .context import context_of
 from .finding import (
     Candidate,
     Effector,
     Observed,
     candidates,
+    check_passive,
     check_standing,
     find_effector,
     find_object,
@@ -58,6 +59,7 @@ class Derived:
         env_id: of the robot's task.
         object: the body that goals are about.
         second: how far off the next body is that is not the robot's, metres; None, there is none.
+        robot: names of the bodies that the robot hangs on the scene with.
         effector: where the observation holds what touches the object; None, nowhere.
         horizon: T of the robot's episodes.
         success_distance: metres within which a goal is reached in every direction.
@@ -74,6 +76,7 @@ class Derived:
     env_id: str
     object: Candidate
     second: float | None
+    robot: tuple[str, ...]
     effector: Effector | None
     horizon: int
     success_distance: float
@@ -176,12 +179,9 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
         )
     seen = observe(env)
     check_standing(seen)
+    check_passive(env)
     found = find_object(seen, _named_object(env))
-    if ends_at_goal(env, found, horizon):
-        raise ValueError(
-            "it ends its episodes at the goal; imagined goals need episodes that go on to their "
-            "time limit: turn that off in the environment"
-        )
+    check_goes_on(env, found, horizon)
     within = success_distance(env, few.goals[:5])
     again, model_again, _ = record_resets(env, 2)
     repeated, unrepeated = _repeated(few, again, sorted(varying_bodies(model, few)))
@@ -194,6 +194,7 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
         env_id,
         found,
         _second(seen, found),
+        tuple(body_name(model, body) for body in robot_roots(model)),
         find_effector(seen, told_effector(env)),
         horizon,
         within,

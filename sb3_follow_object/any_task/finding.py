@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import gymnasium as gym
 import numpy as np
 
 from ..envs.physics_engine import mujoco
-from ..envs.robot_parts import body_name, carrier, robot_bodies, standing, touching_geoms
+from ..envs.robot_parts import (
+    body_name,
+    carrier,
+    pulled,
+    robot_bodies,
+    standing,
+    touching_geoms,
+)
 from .effectors import Fingertips
 from .physics_access import physics_of, placed
 
@@ -16,8 +24,10 @@ N_RESETS, N_STEPS = 20, 30  # that are watched: the steps, at random, are of the
 TOLERANCE = 1e-3  # metres that a body's fixed point may lie off the achieved goal
 _SAME_PLACE = 1e-5  # metres between an effector and what the observation says of it
 _NUDGE = np.array([0.02, -0.03, 0.05])  # metres
-_TURN = np.array([0.3, -0.4, 0.5])  # radians about the axes of what hangs on a ball joint
+_TURN = np.array([0.3, -0.4, 0.5])  # radians about the axes of what is free or on a ball joint
 _STILL = 1e-5  # metres, and parts of an axis, that what stands may seem to move in a step
+_TRIED = 3  # steps that are done again
+_DRIVEN = 1e-3  # metres that what nobody touches may go otherwise in a step
 _LEAST_MOVED = 1e-3  # metres that a thing must have moved to be told from others
 
 
@@ -126,9 +136,15 @@ def observe(env: gym.Env) -> Observed:
 
 
 def check_standing(seen: Observed) -> None:
-    """Raise a ValueError where what stands and can be touched moves within an episode."""
+    """Raise a ValueError where the goal, or what stands and can be touched, moves in an episode."""
     model = seen.model
     steps = np.flatnonzero(seen.episodes[1:] == seen.episodes[:-1])
+    for now, later in zip(seen.desired[steps], seen.desired[steps + 1], strict=True):
+        if not np.array_equal(now, later):
+            raise ValueError(
+                f"the goal moves within an episode, from {now.tolist()} to {later.tolist()}; an "
+                "imagined goal belongs to a whole episode"
+            )
     moved = np.abs(seen.later[steps + 1] - seen.later[steps]).max(axis=(0, 2), initial=0.0)
     stands = standing(model) & ~robot_bodies(model)
     touching = np.unique(model.geom_bodyid[touching_geoms(model)])
@@ -137,6 +153,64 @@ def check_standing(seen: Observed) -> None:
             raise ValueError(
                 f"body {body_name(model, body)} moves within an episode without a joint, which the "
                 "object's scene cannot follow; give it a joint, or let it touch nothing"
+            )
+
+
+def check_passive(env: gym.Env) -> None:
+    """Raise a ValueError where something else than physics moves what is not the robot's.
+
+    A step is done again without the environment: what the robot does not touch moves alike.
+
+    Args:
+        env: is reset and stepped.
+    """
+    for seed in range(_TRIED):
+        env.reset(seed=seed)
+        model, data = physics_of(env)
+        robot = robot_bodies(model)
+        _check_welds(model, data)
+        alone = copy.copy(data)
+        *_, ended, truncated, _ = env.step(env.action_space.sample())
+        again, data = physics_of(env)
+        substeps = round((data.time - alone.time) / model.opt.timestep)
+        if ended or truncated or again is not model or substeps < 1:
+            continue
+        pushed = np.abs(data.xfrc_applied).max(axis=1, initial=0.0)
+        np.maximum.at(pushed, model.dof_bodyid, np.abs(data.qfrc_applied))
+        touched = _touched(model, data, robot)
+        alone.ctrl[:] = data.ctrl
+        alone.mocap_pos[:], alone.mocap_quat[:] = data.mocap_pos, data.mocap_quat
+        mujoco.mj_step(model, alone, substeps)
+        places, theirs = (placed(model, each).xpos for each in (alone, data))
+        off = np.linalg.norm(places - theirs, axis=1)
+        for body in _passive_roots(model):
+            if pushed[body]:
+                raise ValueError(
+                    f"a force is applied to body {body_name(model, body)}, which the object's "
+                    "scene cannot have"
+                )
+            if off[body] > _DRIVEN and not touched:
+                raise ValueError(
+                    f"body {body_name(model, body)} is moved by the environment, not by its "
+                    f"physics alone ({off[body] * 1e3:.0f} mm off after a step), which the "
+                    "object's scene cannot follow; move a body without joints, at resets"
+                )
+
+
+def _touched(model: mujoco.MjModel, data: mujoco.MjData, robot: np.ndarray) -> bool:
+    """Whether the robot touches anything else."""
+    of_robot = robot[model.geom_bodyid[data.contact.geom]]
+    return bool((of_robot[:, 0] != of_robot[:, 1]).any())
+
+
+def _check_welds(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Raise a ValueError where what makes a body the robot's is switched on at resets alone."""
+    for mocap, body, row in pulled(model):
+        if data.eq_active[row] and not model.eq_active0[row]:
+            raise ValueError(
+                f"the equality that lets {body_name(model, mocap)} pull {body_name(model, body)} "
+                "is off in the model and switched on at a reset, so that nobody knows whose that "
+                'is: give it active="true" in the model'
             )
 
 
@@ -226,13 +300,14 @@ def _passive_roots(model: mujoco.MjModel) -> list[int]:
 
 
 def _nudge(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> None:
-    """Move a body along its joints: a free one up and aside, others into their range."""
+    """Move a body along its joints: a free one up, aside and round, others into their range."""
     kinds, first = mujoco.mjtJoint, int(model.body_jntadr[body])
     for joint in range(first, first + int(model.body_jntnum[body])):
         adr, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
         low, high = model.jnt_range[joint]
         if kind == int(kinds.mjJNT_FREE):
             data.qpos[adr : adr + 3] += _NUDGE
+            mujoco.mju_quatIntegrate(data.qpos[adr + 3 : adr + 7], _TURN, 1.0)
         elif kind == int(kinds.mjJNT_BALL):
             mujoco.mju_quatIntegrate(data.qpos[adr : adr + 4], _TURN, 1.0)
         elif model.jnt_limited[joint]:  # a quarter off the end that is farther

@@ -12,7 +12,13 @@ import numpy as np
 from ..common.array_trees import load_tree, save_tree
 from ..envs.goal_space import goal_space
 from ..envs.physics_engine import mujoco
-from ..envs.robot_parts import body_name, robot_bodies, standing, touching_geoms
+from ..envs.robot_parts import (
+    body_name,
+    equated_bodies,
+    robot_bodies,
+    standing,
+    touching_geoms,
+)
 from .physics_access import physics_of
 
 SURFACE_SHARE, SURFACE_HEIGHT = 0.99, 0.012  # share of the goals, metres off the start's height
@@ -88,6 +94,7 @@ def record_resets(env: gym.Env, n: int) -> tuple[Resets, mujoco.MjModel, mujoco.
         if first is None:
             first = copy.copy(model), copy.copy(data)
         check_same_shapes(first[0], model)
+        check_same_equalities(first, (model, data))
         rows.append(
             (
                 np.array(obs["desired_goal"], np.float64),
@@ -108,12 +115,13 @@ def check_same_shapes(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
     what has joints is elsewhere by their positions. The robot may change as it likes, and so may
     what touches nothing.
     """
-    if (first.nbody, first.ngeom, first.nq) != (model.nbody, model.ngeom, model.nq):
+    if any(getattr(first, name) != getattr(model, name) for name in _NUMBERS):
         raise ValueError(
-            "its model has other bodies, geoms or joints in other episodes; the object's scene "
-            "needs the same in all: move what is not wanted out of the way"
+            "its model has other bodies, geoms, joints or equalities in other episodes; the "
+            "object's scene needs the same in all: move what is not wanted out of the way"
         )
     _check_hung(first, model)
+    _check_joints(first, model)
     for what, name in _SHAPES.items():
         differ = _differing(first, model, name)
         if differ.any():  # in few resets
@@ -122,7 +130,30 @@ def check_same_shapes(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
     if heights[0] != heights[1] or _differing(first, model, "hfield_data").any():
         fields = first.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD)
         _refuse_geoms(first, model, fields, "height field")
+    if first.nmeshvert != model.nmeshvert or not np.array_equal(first.mesh_vert, model.mesh_vert):
+        _refuse_geoms(first, model, _other_meshes(first, model), "mesh")
 
+
+def check_same_equalities(
+    first: tuple[mujoco.MjModel, mujoco.MjData], now: tuple[mujoco.MjModel, mujoco.MjData]
+) -> None:
+    """Raise a ValueError where equalities of what is not the robot's differ between episodes."""
+    (model, data), (other, state) = first, now
+    differ = _differing(model, other, "eq_data") | (data.eq_active != state.eq_active)
+    if not differ.any():  # as in most resets
+        return
+    robot = robot_bodies(model)
+    for row in map(int, np.flatnonzero(differ)):
+        bodies = equated_bodies(model, row)
+        if bodies and not robot[bodies].any():
+            raise ValueError(
+                f"equality {model.equality(row).name or row} of "
+                f"{' and '.join(body_name(model, body) for body in bodies)} is another in other "
+                "episodes, or off in some, which the object's scene cannot follow"
+            )
+
+
+_NUMBERS = ("nbody", "ngeom", "nq", "njnt", "neq")
 
 _SHAPES = {
     "type": "geom_type",
@@ -175,6 +206,47 @@ def _check_hung(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
             "which the object's scene cannot follow; hang it on a body without joints, and move "
             "that"
         )
+
+
+def _check_joints(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
+    """Raise a ValueError where what is not the robot's hangs on other joints than at first."""
+    limited = (first.jnt_limited != 0) | (model.jnt_limited != 0)
+    differ = {what: _differing(first, model, name) for what, name in _OF_JOINTS.items()}
+    differ["range"] &= limited
+    # Of joints of several numbers it is not what they are counted from.
+    of_one = np.isin(first.jnt_type, (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE))
+    differ["reference"] = _differing(first, model, "qpos0")[first.jnt_qposadr] & of_one
+    if not any(rows.any() for rows in differ.values()):  # as in most resets
+        return
+    robot = robot_bodies(first)
+    for what, rows in differ.items():
+        for joint in map(int, np.flatnonzero(rows & ~robot[first.jnt_bodyid])):
+            raise ValueError(
+                f"joint {first.joint(joint).name or joint} of body "
+                f"{body_name(first, int(first.jnt_bodyid[joint]))} has another {what} in other "
+                "episodes, which the object's scene cannot follow; hang it on a body without "
+                "joints, and move that"
+            )
+
+
+_OF_JOINTS = {
+    "type": "jnt_type",
+    "place": "jnt_pos",
+    "axis": "jnt_axis",
+    "limit": "jnt_limited",
+    "range": "jnt_range",
+}
+
+
+def _other_meshes(first: mujoco.MjModel, model: mujoco.MjModel) -> np.ndarray:
+    """Which geoms have a mesh with other vertices than the first model's, bool (ngeom,)."""
+    meshes = first.geom_type == int(mujoco.mjtGeom.mjGEOM_MESH)
+    if first.nmeshvert != model.nmeshvert:
+        return meshes
+    moved = np.flatnonzero((first.mesh_vert != model.mesh_vert).any(axis=1))
+    of_vertex = np.searchsorted(first.mesh_vertadr, moved, side="right") - 1
+    differ: np.ndarray = meshes & np.isin(first.geom_dataid, of_vertex)
+    return differ
 
 
 def varying_bodies(model: mujoco.MjModel, resets: Resets) -> frozenset[int]:

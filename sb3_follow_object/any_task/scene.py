@@ -35,6 +35,14 @@ _NO_PHYSICS = re.compile(
     """,
     re.VERBOSE,
 )
+_OF_DOFS = (
+    "dof_armature",
+    "dof_damping",
+    "dof_dampingpoly",
+    "dof_frictionloss",
+    "dof_solref",
+    "dof_solimp",
+)
 _POSES = ("body_pos", "body_quat")
 
 
@@ -120,6 +128,9 @@ def object_scene_of(
     alone = spec.compile()
     substeps = max(1, round(STEP / alone.opt.timestep))
     positions, velocities = _places_in(model, alone, copied)
+    for name in _OF_DOFS:  # a joint of several has one number for all of them in a spec
+        if hasattr(model, name):
+            getattr(alone, name)[:] = getattr(model, name)[velocities]
     scene = DerivedScene(
         task,
         alone,

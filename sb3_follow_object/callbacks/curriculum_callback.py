@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import (
 
 from ..ddpg.whole_episodes import WholeEpisodesDDPG
 from ..imagination.curriculum import Curriculum
+from ..imagination.goal_env import check_unstacked
 from ..imagination.vec_env import ImaginedGoalVecEnv, imagination_of
 from ..replay.following import end_running_episodes, episodes_are_whole, follow_env
 from ..settings.stages import CurriculumTestSettings
@@ -29,9 +30,10 @@ _ASKER = "CurriculumCallback"
 class CurriculumCallback(CopyableCallback):
     """Test the policy on h_max without noise and advance k_max (paper, Algorithm 1).
 
-    A test is due after every ``every`` cycles. A cycle is a rollout that has finished at least one
-    episode; rollouts of a few steps add up to one. Nothing is tested once the curriculum is
-    finished. Records curriculum/k_max, curriculum/test_success and curriculum/test_steps.
+    A test is due after every ``every`` cycles. A cycle is as many ended episodes as there are
+    copies, at least, and ends with a rollout; rollouts of a few steps add up to one. Nothing is
+    tested once the curriculum is finished. Records curriculum/k_max, curriculum/test_success and
+    curriculum/test_steps.
 
     The model carries the curriculum's state as ``model.curriculum_state``, which SB3 saves with it:
     training that goes on from a loaded model goes on at its k_max. A model that has not trained
@@ -85,7 +87,7 @@ class CurriculumCallback(CopyableCallback):
         self.store = settings.store
         self.test_steps = 0
         self._cycles = 0
-        self._episode_ended = False
+        self._ended = 0  # episodes of the cycle that goes on
         self._is_training = False
         self._trained: BaseAlgorithm | None = None  # the model that training began with last
 
@@ -110,17 +112,18 @@ class CurriculumCallback(CopyableCallback):
         return {
             "test_steps": self.test_steps,
             "cycles": self._cycles,
-            "episode_ended": self._episode_ended,
+            "ended": self._ended,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict``."""
         self.test_steps = int(state["test_steps"])
         self._cycles = int(state["cycles"])
-        self._episode_ended = bool(state["episode_ended"])
+        self._ended = int(state.get("ended", 0))  # saves of before had none
 
     def _on_training_start(self) -> None:
         check_hears_rollouts(self)
+        check_unstacked(self.training_env)
         self._follow_training_env()
         broken_off = self._is_training and self.model.num_timesteps > 0
         # Who knows what step the environment stands at after an exception? Ours do.
@@ -132,20 +135,15 @@ class CurriculumCallback(CopyableCallback):
         another = self._trained is not self.model
         if self._trained is not None and self.model.num_timesteps == 0:
             self.test_steps = 0  # counted anew, as SB3 does its steps unless told otherwise
-            self._cycles, self._episode_ended = 0, False
+            self._cycles = self._ended = 0
+        before = imagination_of(self.training_env, _ASKER)[1].state_dict()
         if another and hasattr(self.model, "curriculum_state"):
             self.curriculum.load_state_dict(self.model.curriculum_state)
         elif another and self.model.num_timesteps == 0:
-            self._restart_curriculum()
+            self.curriculum.restart()  # whatever another model has come to in these wrappers
         self._trained = self.model
         self._share_curriculum()
-
-    def _restart_curriculum(self) -> None:
-        """Begin at the first level, whatever another model has come to in these wrappers."""
-        before = imagination_of(self.training_env, _ASKER)[1].state_dict()
-        self.curriculum.restart()
         if self.curriculum.state_dict() != before:  # running episodes show goals of other levels
-            self._share_curriculum()
             self._begin_new_episodes()
 
     def _follow_training_env(self) -> None:
@@ -187,12 +185,13 @@ class CurriculumCallback(CopyableCallback):
             end_running_episodes(self._replay_buffer)
 
     def _on_step(self) -> bool:
-        self._episode_ended |= bool(np.any(self.locals["dones"]))
+        self._ended += int(np.sum(self.locals["dones"]))
         return True
 
     def _on_rollout_end(self) -> None:
-        self._cycles += self._episode_ended
-        self._episode_ended = False
+        if self._ended >= self.training_env.num_envs:
+            self._cycles += 1
+            self._ended = 0
         if self._cycles >= self.every and not self.curriculum.finished:
             self._cycles = 0
             self._test()
@@ -252,6 +251,8 @@ class CurriculumCallback(CopyableCallback):
         ) -> None:
             # Buffers of SB3 hold actions scaled to [-1, 1].
             stored = self.model.policy.scale_action(actions) if continuous else actions
+            # Not in VecNormalize here, where it would be what that has made of the last one.
+            infos = [{k: info[k] for k in info if k != "terminal_observation"} for info in infos]
             buffer.add(obs, next_obs, stored, rewards, dones, infos)
 
         return store

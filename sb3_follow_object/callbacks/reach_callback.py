@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import unwrap_vec_wrapper
+from stable_baselines3.common.vec_env import unwrap_vec_normalize, unwrap_vec_wrapper
 
 from ..reach.policy import ReachPolicy
 from ..reach.vec_env import ReachFirstVecEnv
@@ -20,14 +20,15 @@ _LEAST_SHARE = 0.02  # below it nobody reaches first any more
 
 
 class ReachCallback(CopyableCallback):
-    """Teach the reach policy after each rollout and carry it into the environments.
+    """Teach the reach policy after rollouts and carry it into the environments.
 
-    Where the effector is and when it has arrived it takes from the environment's wrapper. A rollout
-    that ends no episode teaches nothing. The reach policy learns the less the fewer of its episodes
-    fail. The share of episodes that begin with reaching falls as the learner's own episodes come to
-    the place by themselves; while it is nothing the reach policy learns no more. Records
-    reach/share, reach/success (of episodes that begin with reaching) and reach/own_success (of all
-    others). It keeps what it has learned when another training begins.
+    Where the effector is and when it has arrived it takes from the environment's wrapper. It
+    teaches when a rollout ends, if as many episodes have ended as there are copies. The reach
+    policy learns the less the fewer of its episodes fail. The share of episodes that begin with
+    reaching falls as the learner's own episodes come to the place by themselves; while it is
+    nothing the reach policy learns no more. Records reach/share, reach/success (of episodes that
+    begin with reaching) and reach/own_success (of all others). It keeps what it has learned when
+    another training begins.
 
     Args:
         seed: of the reach policy; None draws one from NumPy's global stream, which SB3 seeds.
@@ -41,8 +42,8 @@ class ReachCallback(CopyableCallback):
 
     Raises:
         ValueError: an invalid setting; or training starts in an environment without
-            ReachFirstVecEnv or ReachFirstWrapper, or with another replay buffer than
-            FollowObjectReplayBuffer.
+            ReachFirstVecEnv or ReachFirstWrapper, with another replay buffer than
+            FollowObjectReplayBuffer, or with a wrapper outside that changes the "observation".
     """
 
     def __init__(self, seed: int | None = None, verbose: int = 0, **settings: Any) -> None:
@@ -52,7 +53,8 @@ class ReachCallback(CopyableCallback):
         self.seed = seed
         self.policy: ReachPolicy | None = None
         self.success = self.own_success = 0.0
-        self._episode_ended = False
+        self._ended = 0  # episodes since it last taught
+        self._has_looked = False  # at what the wrapper reaches by
 
     @property
     def share(self) -> float:
@@ -68,6 +70,7 @@ class ReachCallback(CopyableCallback):
 
     def _on_training_start(self) -> None:
         check_hears_rollouts(self)
+        self._has_looked = False
         if not self._is_wrapped():
             raise ValueError(
                 "ReachCallback needs an environment wrapped in ReachFirstVecEnv or "
@@ -104,12 +107,32 @@ class ReachCallback(CopyableCallback):
             self._ask("set_reach", self.policy.actor(), 0.0)
 
     def _on_step(self) -> bool:
-        self._episode_ended |= bool(np.any(self.locals["dones"]))
+        self._ended += int(np.sum(self.locals["dones"]))
+        if not self._has_looked:
+            self._check_observation(self.locals["new_obs"]["observation"])
+            self._has_looked = True
         return True
 
+    def _check_observation(self, seen: np.ndarray) -> None:
+        """Raise a ValueError where a wrapper outside changes what the reach policy is taught on.
+
+        Args:
+            seen: what the learner sees after a step, (n_envs, d).
+        """
+        normaliser = unwrap_vec_normalize(self.training_env)
+        if normaliser is not None:
+            seen = normaliser.get_original_obs()["observation"]
+        played = np.concatenate(self._ask("reach_observation"))
+        if seen.shape != played.shape or not np.allclose(seen, played, equal_nan=True):
+            raise ValueError(
+                "a wrapper outside of ReachFirstWrapper or ReachFirstVecEnv changes the "
+                "observation, which the reach policy then knows otherwise than it is taught: put "
+                "it inside"
+            )
+
     def _on_rollout_end(self) -> None:
-        if self._episode_ended:
-            self._episode_ended = False
+        if self._ended >= self.training_env.num_envs:
+            self._ended = 0
             self._count()
             self._teach()
         self.logger.record("reach/share", self.share)
@@ -160,13 +183,13 @@ class ReachCallback(CopyableCallback):
             "policy": None if self.policy is None else self.policy.state_dict(),
             "success": float(self.success),
             "own_success": float(self.own_success),
-            "episode_ended": self._episode_ended,
+            "ended": self._ended,
         }
 
     def load_state_dict(self, state: dict[str, Any], model: Any) -> None:
         """Continue from ``state_dict``; `model` is the one that will be trained."""
         self.success, self.own_success = float(state["success"]), float(state["own_success"])
-        self._episode_ended = bool(state["episode_ended"])
+        self._ended = int(state.get("ended", 0))  # saves of before had none
         if state["policy"] is not None:
             self.model = model
             self.policy = self._make_policy()

@@ -55,6 +55,7 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
         "reached": f"within {found.success_distance * 1e3:.0f} mm" + _shifted(found),
         "varies": _varies(found),
         "moves": "on its surface, unless it does not learn so" if found.on_surface else "freely",
+        "robot": _robot(found),
         "effector": _effector(found),
         "speed": _speed(found),
         "episodes": f"{found.horizon} steps; the object's {found.scene.task.horizon}",
@@ -145,6 +146,11 @@ def _shifted(found: Derived) -> str:
     return "; rewards of 1 and 0 are shown as 0 and -1" if found.shifted else ""
 
 
+def _robot(found: Derived) -> str:
+    """What actuators or mocap bodies move, which the object's own scene is without."""
+    return ", ".join(found.robot) or "nothing that an actuator moves"
+
+
 def _effector(found: Derived) -> str:
     if found.effector is None:
         return "not told in the observation"
@@ -160,9 +166,9 @@ def _speed(found: Derived) -> str:
     entries = list(found.effector.entries)
     env: gym.Env = robot_maker(found.env_id)()
     try:
-        seen = [env.reset(seed=seed)[0] for seed in range(_RESETS)]
-        effectors = np.array([obs["observation"][entries] for obs in seen])
-        objects = np.array([obs["achieved_goal"] for obs in seen])
+        seen = [_begun(env, seed) for seed in range(_RESETS)]
+        effectors = np.array([observation[entries] for observation, _ in seen])
+        objects = np.array([achieved for _, achieved in seen])
         fastest = max(_moved(env, action, entries) for action in _extremes(env.action_space))
     finally:
         env.close()
@@ -178,6 +184,12 @@ def _speed(found: Derived) -> str:
     )
     slow = "; too slow: make episodes longer, or do each action more than once"
     return told + slow * (sum(steps) > _BUSY * found.horizon)
+
+
+def _begun(env: gym.Env, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Copies of the observation and the achieved goal that an episode begins with."""
+    obs, _ = env.reset(seed=seed)
+    return np.array(obs["observation"]), np.array(obs["achieved_goal"])
 
 
 def _extremes(actions: gym.Space) -> np.ndarray:

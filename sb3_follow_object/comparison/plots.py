@@ -74,7 +74,10 @@ def was_validated(folder: str | os.PathLike[str]) -> bool:
 
 def _read_rows(path: Path) -> list[dict[str, str]]:
     """Return the rows of a file of evaluations, none where there is no such file."""
-    return read_rows(path, "file of evaluations") if path.exists() else []
+    rows = read_rows(path, "file of evaluations") if path.exists() else []
+    if any(None in (*row, *row.values()) for row in rows):
+        raise ValueError(f"{path} is not a file of evaluations (a line is cut, or too long)")
+    return rows
 
 
 def read_rows(path: Path, kind: str) -> list[dict[str, str]]:

@@ -7,9 +7,10 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from ..envs.goal_envs import episode_steps, missing_goal_keys
+from ..imagination.goal_env import check_unstacked
 
 
 def check_goals(space: spaces.Space) -> None:
@@ -37,11 +38,7 @@ def check_wrappers(env: Any) -> None:
             "HerDDPG standardises its inputs itself and knows the range of its rewards; leave "
             "VecNormalize (rl_zoo3's normalize) out"
         )
-    if is_vecenv_wrapped(env, VecFrameStack):
-        raise ValueError(
-            "VecFrameStack (rl_zoo3's frame_stack) stacks goals too, for which the environment "
-            "has no reward; leave it out"
-        )
+    check_unstacked(env)
 
 
 def horizon_of(env: Any) -> int:

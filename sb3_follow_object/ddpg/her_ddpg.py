@@ -271,7 +271,7 @@ class HerDDPG(KeptDDPG):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if isinstance(self.replay_buffer, FollowObjectReplayBuffer):
-            self.replay_buffer.check_size()  # before the first step rather than after it
+            self.replay_buffer.check_first()  # before the first step rather than after it
         return super()._setup_learn(*args, **kwargs)
 
     def _make_device_replay(self) -> DeviceReplay | None:

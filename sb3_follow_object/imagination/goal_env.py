@@ -7,8 +7,11 @@ from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped
 
 from ..common.answers import check_shape
+from ..envs import IDS
 from ..envs.goal_envs import SUCCESS_METHODS, missing_goal_keys
 from ..envs.goal_space import GoalSpace, followed_space
 from .curriculum import Curriculum
@@ -28,6 +31,20 @@ def check_horizons(predictor: GoalPredictor, curriculum: Curriculum) -> None:
             f"but the curriculum has horizon {curriculum.horizon}: give "
             f"Curriculum({predictor.horizon}), or an F_phi learned in episodes of "
             f"{curriculum.horizon} steps (register_task makes a task of that horizon)."
+        )
+
+
+def check_made_for(predictor: GoalPredictor, spec: EnvSpec | None) -> None:
+    """Refuse an F_phi that was made for another task than this one of the package's.
+
+    Args:
+        predictor: F_phi; one of a task of others may be fitted to anybody's paths.
+        spec: of the environment, where it has one.
+    """
+    if spec is not None and spec.id in IDS and predictor.env_id not in ("", spec.id):
+        raise ValueError(
+            f"The predictor was made for env_id {predictor.env_id!r}, not for {spec.id!r}: fit one "
+            "for that task."
         )
 
 
@@ -58,6 +75,24 @@ def check_reaches_outside(reaches: bool) -> None:
         raise ValueError(
             "imagined goals go inside of reaching first: put ReachFirstVecEnv or ReachFirstWrapper "
             "around ImaginedGoalVecEnv or ImaginedGoalWrapper, not inside it"
+        )
+
+
+def check_imagines_once(imagines: bool) -> None:
+    """Refuse an environment that shows imagined goals already: they are not the task's own."""
+    if imagines:
+        raise ValueError(
+            "the environment imagines goals already: leave one of ImaginedGoalWrapper (rl_zoo3's "
+            "env_wrapper) and ImaginedGoalVecEnv out"
+        )
+
+
+def check_unstacked(env: Any) -> None:
+    """Raise a ValueError for an environment in VecFrameStack."""
+    if is_vecenv_wrapped(env, VecFrameStack):
+        raise ValueError(
+            "VecFrameStack (rl_zoo3's frame_stack) stacks goals too, for which the environment "
+            "has no reward; leave it out"
         )
 
 

@@ -64,6 +64,7 @@ class GoalPredictor(WholeCopies):
 
     space: GoalSpace = POSITIONS
     context: tuple[str, ...] = ()
+    env_id = ""  # of one that says nothing
 
     def __init__(
         self,

@@ -26,6 +26,8 @@ from .goal_env import (
     Observation,
     check_goal_stays,
     check_horizons,
+    check_imagines_once,
+    check_made_for,
     check_reaches_outside,
     checked_goals,
     needed_success_method,
@@ -87,9 +89,11 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
                 f"Curriculum, not {type(predictor).__name__} and {type(curriculum).__name__}"
             )
         check_reaches_outside(hasattr(venv, "set_reach") or venv.has_attr("set_reach"))
+        check_imagines_once(curriculum_of(venv) is not None)
         super().__init__(venv)
         self._space, self._dtype = checked_goals(venv.observation_space, venv.has_attr)
         check_horizons(predictor, curriculum)
+        check_made_for(predictor, venv.get_attr("spec", [0])[0] if venv.has_attr("spec") else None)
         self._success_method = needed_success_method(venv.has_attr)
         self.predictor = predictor
         self.curriculum = curriculum

@@ -31,6 +31,8 @@ from .goal_env import (
     Observation,
     check_goal_stays,
     check_horizons,
+    check_imagines_once,
+    check_made_for,
     check_reaches_outside,
     checked_goals,
     needed_success_method,
@@ -88,6 +90,7 @@ class ImaginedGoalWrapper(
             )
         env = with_face(env)
         check_reaches_outside(env.has_wrapper_attr("set_reach"))
+        check_imagines_once(env.has_wrapper_attr("load_curriculum"))
         super().__init__(env)
         self._space, self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)
         self._compute_reward = env.get_wrapper_attr("compute_reward")
@@ -103,6 +106,7 @@ class ImaginedGoalWrapper(
         self._predictor = predictor
         if isinstance(predictor, GoalPredictor):
             check_horizons(predictor, self.curriculum)
+            check_made_for(predictor, env.spec)
         self._rng = np.random.default_rng()
         self._shown = self._original = np.zeros(self._space.size, self._dtype)
         self._level = 0

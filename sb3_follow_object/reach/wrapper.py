@@ -62,6 +62,10 @@ class ReachFirstWrapper(
         """Return how it reaches."""
         return self.approach.settings
 
+    def reach_observation(self) -> np.ndarray:
+        """Return the "observation" that it reaches by, (1, d)."""
+        return self._obs["observation"]
+
     def take_counts(self) -> np.ndarray:
         """Return `Approach.counts` since the last call, (2, 2) int."""
         return self.approach.take_counts()

@@ -72,7 +72,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
                 replaced; nothing is stored.
         """
         if self.n_added == 0:
-            self.check_size()
+            self.check_first()
         next_obs = self._with_last_observations(next_obs, done, infos)
         if any(EXECUTED in info for info in infos):
             action = self._executed(action, infos)
@@ -318,7 +318,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
             later,
         )
 
-    def check_size(self) -> None:
+    def check_first(self) -> None:
         """Raise a ValueError where the buffer cannot hold an episode of every environment.
 
         Not done as it is made: what is loaded only to act may have next to none.

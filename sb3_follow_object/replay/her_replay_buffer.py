@@ -15,6 +15,7 @@ from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from ..common.answers import one_each
 from ..common.numbers import checked_whole
 from ..imagination.curriculum import Curriculum
+from ..imagination.goal_env import check_unstacked
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.imagined_goals import imagine_afar
 from ..imagination.vec_env import curriculum_of, imagination_of
@@ -76,9 +77,9 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
     The other arguments are HerReplayBuffer's.
 
     Raises:
-        ValueError: an argument is outside its range, actions have no bounds, imagined goals are
-            asked for without the wrapper that imagines them, or, at the first step, an episode does
-            not fit; or, at a sample with `goal_margin`, there are more than two rewards.
+        ValueError: an argument is outside its range, or actions have no bounds; at the first step,
+            an episode does not fit, or imagined goals are asked for without the wrapper that
+            imagines them; or, at a sample with `goal_margin`, there are more than two rewards.
     """
 
     goal_margin = scene_distance = 0.0  # of buffers pickled before there were any
@@ -159,8 +160,9 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             )
         self.n_added = 0  # time-steps so far
         if env is not None:
-            self.check_env(env)  # raises now rather than at the first sample
-            self._make_room_for_contexts(env)
+            self._check_asked(env)  # raises now rather than at the first sample
+            if curriculum_of(env) is not None:  # else whoever was loaded may only act there
+                self._make_room_for_contexts(env)
         self.rng = np.random.default_rng(
             np.random.randint(2**31) if settings.seed is None else settings.seed
         )
@@ -211,7 +213,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
 
     def check_env(self, env: VecEnv) -> None:
         """Raise a ValueError for an environment that `set_env` refuses."""
-        check_copies(self.n_envs, env.num_envs)
+        self._check_asked(env)
         if self.imagined_ratio > 0.0:
             n, stored = len(imagination_of(env, IMAGINED_RATIO)[0].context), self.contexts.shape[-1]
             if self.size() and n != stored:
@@ -219,6 +221,16 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
                     f"the environment's predictor sees {n} numbers of other things' places, but the"
                     f" replay buffer holds {stored} of each step; give the model a new buffer"
                 )
+
+    def check_first(self) -> None:
+        """Refuse to begin where imagined goals are asked for and nothing imagines any, too."""
+        super().check_first()
+        if self.imagined_ratio > 0.0:
+            imagination_of(self.env, IMAGINED_RATIO)
+
+    def _check_asked(self, env: VecEnv) -> None:
+        check_copies(self.n_envs, env.num_envs)
+        check_unstacked(env)
         asks = self.reward_function is None and self.her_ratio > 0.0
         if asks and not env.has_attr("compute_reward"):
             raise ValueError(

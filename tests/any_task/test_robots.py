@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from tree import ROOT
 
+from sb3_follow_object.any_task.derived import derived
 from sb3_follow_object.any_task.finding import find_object, observe
 from sb3_follow_object.any_task.physics_access import physics_of
 from sb3_follow_object.envs.registration import import_task
@@ -70,3 +71,13 @@ def test_an_object_thrown_alone_moves_as_in_the_whole_scene(
     assert np.linalg.norm(data.xpos[found.body] - start) > 0.02, "it was thrown"
     assert max(off) <= TENTH_OF_MM
     env.close()
+
+
+@pytest.mark.parametrize(("package", "env_id"), TASKS, ids=[env_id for _, env_id in TASKS])
+def test_nothing_of_it_is_refused(
+    package: str, env_id: str, few_resets: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip(package, reason=f"{package} is installed by itself (docs/robots.md)")
+    monkeypatch.setattr(sys, "path", [str(ROOT / "benchmarks" / "robots"), *sys.path])
+    found = derived(env_id)
+    assert len(found.resets) == 60 and found.robot

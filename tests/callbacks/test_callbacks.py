@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,13 @@ import toy
 from imagined import N, bare, imagining, learner
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
 from sb3_follow_object.callbacks.eval_callback import OriginalGoalEvalCallback
@@ -72,6 +80,49 @@ def test_a_cycle_needs_a_finished_episode() -> None:
     assert callback.test_steps == 3 * N * toy.HORIZON
     assert model.num_timesteps == (7 + 3) * N * toy.HORIZON
     assert model.replay_buffer.pos == (7 + 3) * toy.HORIZON
+
+
+class Short(toy.PointEnv):
+    """Its episodes have as many steps as are said."""
+
+    def __init__(self, length: int) -> None:
+        super().__init__()
+        self.length = length
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, terminated, _, info = super().step(action)
+        return obs, reward, terminated, self.steps >= self.length, info
+
+
+def test_a_cycle_is_as_many_episodes_as_copies_however_they_end() -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    lengths = [5 + copy for copy in range(N)]
+    env = DummyVecEnv([partial(Short, length) for length in lengths])
+    callback = CurriculumCallback(imagining(curriculum, "test"), N)
+    model = learner(ImaginedGoalVecEnv(env, toy.StraightPredictor(), curriculum), train_freq=1)
+    model.learn(100 * N, callback=callback)
+    trained = (model.num_timesteps - callback.test_steps) // N
+    tests, ended = callback.test_steps / (N * toy.HORIZON), sum(trained // n for n in lengths)
+    assert ended / N / 2 <= tests <= ended / N, "not one wherever any copy's episode has ended"
+
+
+def test_stacked_goals_are_refused() -> None:
+    curriculum = toy.curriculum()
+    model = learner(VecFrameStack(imagining(curriculum), 2))
+    callback = CurriculumCallback(imagining(curriculum, "test"), N)
+    with pytest.raises(ValueError, match=r"VecFrameStack .* stacks goals too"):
+        model.learn(10, callback=callback)
+
+
+def test_tests_give_no_alarm_about_what_vec_normalize_has_clipped() -> None:
+    curriculum = toy.curriculum(threshold=1.0, k_max=6)
+    env = VecNormalize(imagining(curriculum), norm_reward=False, clip_obs=0.01)
+    callback = CurriculumCallback(imagining(curriculum, "test"), N)
+    model = learner(env)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(2 * N * toy.HORIZON, callback=callback)
+    assert callback.test_steps > 0
 
 
 def test_tests_are_stored_as_whole_episodes_with_scaled_actions() -> None:
@@ -302,6 +353,20 @@ def test_a_loaded_model_goes_on_at_its_k_max_with_a_test_env(tmp_path: Path) -> 
     loaded.learn(10, callback=CurriculumCallback(imagining(begun, "test"), N))
     assert begun.k_max == 6
     assert loaded.curriculum_state["k_max"] == 6
+
+
+def test_a_loaded_models_first_episodes_are_of_its_k_max(tmp_path: Path) -> None:
+    options: Any = {"p": 0.0, "sampling": "max", "threshold": 1.0}
+    curriculum = toy.curriculum(k_max=7, **options)
+    model = learner(imagining(curriculum))
+    callback = CurriculumCallback(imagining(curriculum, "test"), N)
+    model.learn(N * toy.HORIZON, callback=callback)
+    model.save(tmp_path / "model")
+    begun = toy.curriculum(k_max=2, **options)
+    env = VecMonitor(imagining(begun), info_keywords=("imagined_level",))
+    loaded = DDPG.load(tmp_path / "model", env=env)
+    loaded.learn(N * toy.HORIZON, callback=CurriculumCallback(imagining(begun, "test"), N))
+    assert [info["imagined_level"] for info in loaded.ep_info_buffer] == [7] * N
 
 
 @pytest.mark.parametrize("face", ["VecEnv", "gymnasium"])

@@ -221,6 +221,33 @@ def test_a_callback_is_not_taught_with_other_observations() -> None:
         learner(other).learn(N * HORIZON, callback)
 
 
+@pytest.mark.parametrize("normalised", [False, True])
+@pytest.mark.parametrize(
+    ("longer", "changes"),
+    [(0, lambda told: told * 100.0 + 7.0), (1, lambda told: np.append(told, 0.5))],
+    ids=["scaled", "longer"],
+)
+def test_a_wrapper_outside_that_changes_the_observation_is_refused(
+    longer: int, changes: Callable[[np.ndarray], np.ndarray], normalised: bool
+) -> None:
+    def make() -> gym.Env:
+        env = reaching_env()
+        inner = env.observation_space
+        assert isinstance(inner, spaces.Dict)
+        size = inner["observation"].shape[0] + longer  # type: ignore[index]
+        told = spaces.Box(-np.inf, np.inf, (size,), np.float64)
+        return TransformObservation(
+            env,
+            lambda obs: {**obs, "observation": changes(obs["observation"])},
+            spaces.Dict({**inner.spaces, "observation": told}),
+        )
+
+    env: VecEnv = DummyVecEnv([make] * N)
+    model = learner(VecNormalize(env, norm_reward=False) if normalised else env, "DDPG")
+    with pytest.raises(ValueError, match=r"a wrapper outside of ReachFirst.* put it inside"):
+        model.learn(N * HORIZON, ReachCallback(**TINY))
+
+
 def test_it_takes_what_every_callback_of_sb3_takes() -> None:
     assert ReachCallback(verbose=1).verbose == 1 and CurriculumCallback(verbose=1).verbose == 1
 

@@ -52,6 +52,35 @@ def test_it_says_what_is_found(capsys: pytest.CaptureFixture[str]) -> None:
     assert "where 60 episodes of ArmAndWall-v0 begin is recorded, once" in told.err
 
 
+class Reusing(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
+    """Gives the same arrays with each observation."""
+
+    told: dict[str, np.ndarray] | None = None
+
+    def _observation(self) -> Any:
+        now = super()._observation()
+        if self.told is None:
+            self.told = now
+        for key, value in now.items():
+            self.told[key][:] = value
+        return self.told
+
+
+gym.register("Reusing-v0", Reusing, max_episode_steps=50)
+
+
+def test_arrays_that_an_environment_reuses_make_no_difference(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    told = []
+    for env_id in ("Reusing-v0", ARM):
+        assert main(["inspect", "--env", env_id]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        told.append([line for line in lines if line.startswith(("speed", "robot", "goal"))])
+    assert told[0] == told[1]
+    assert told[0][1].split(None, 1) == ["robot", "upper arm"]
+
+
 class Slow(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
     """Does what it is told at a third of the speed."""
 

@@ -109,6 +109,53 @@ def test_passive_joints_of_every_kind_are_kept(joint: str | int, velocity: np.nd
         np.testing.assert_allclose(state.joint(new).qpos, data.joint(old).qpos, atol=TENTH_OF_MM)
 
 
+EQUAL = '<equality><connect body1="post" body2="box" anchor="0 0 0"/></equality>'
+BOX = """
+<mujoco>
+  <option density="1000" viscosity="0.1">{flag}</option>
+  <worldbody>
+    <geom type="plane" size="2 2 .1"/>
+    <body name="post" pos="0 0 0.2"/>
+    <body name="box" pos="0.1 0 0.2">
+      <freejoint/>
+      <geom type="box" size=".04 .02 .01" mass=".2"/>
+      <geom type="box" size=".1 .02 .01" mass="0" contype="0" conaffinity="0" {fluid}/>
+    </body>
+  </worldbody>
+  {equality}
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "off"),
+    [
+        ({"flag": '<flag equality="disable"/>', "equality": EQUAL}, False),
+        ({"equality": EQUAL}, False),
+        ({"equality": EQUAL}, True),
+        ({"fluid": 'fluidshape="ellipsoid" fluidcoef="0.6 0.3 1.4 1.1 0.9"'}, False),
+        ({}, False),
+    ],
+    ids=["equalities disabled", "on", "switched off", "in water", "in water, without a shape"],
+)
+def test_equalities_and_water_are_those_of_the_task(words: dict[str, str], off: bool) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        BOX.format(**{"flag": "", "equality": "", "fluid": "", **words})
+    )
+    data = mujoco.MjData(model)
+    if off:
+        data.eq_active[0] = 0
+    mujoco.mj_forward(model, data)
+    alone, state = passive(model, data)
+    thrown = np.array([0.2, 0.4, 1.0, 1.0, 2.0, 3.0])
+    for each in (data, state):
+        each.qvel[:] = thrown
+    for _ in range(round(SECONDS / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+        mujoco.mj_step(alone, state)
+        assert np.abs(data.qpos - state.qpos).max() <= TENTH_OF_MM
+
+
 def test_a_robot_is_what_hangs_on_the_first_joint_that_is_driven() -> None:
     model, _ = kitchen()
     robot = {body_name(model, int(body)) for body in np.flatnonzero(robot_bodies(model))}

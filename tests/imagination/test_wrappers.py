@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
+from sb3_follow_object import make_vec
 from sb3_follow_object.imagination.curriculum import Curriculum
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
@@ -62,6 +63,32 @@ def test_what_reaches_first_goes_outside() -> None:
             ImaginedGoalVecEnv(inner, toy.StraightPredictor(), toy.curriculum())
     with pytest.raises(ValueError, match="imagined goals go inside of reaching first"):
         ImaginedGoalWrapper(reaching(), toy.StraightPredictor(), toy.curriculum())
+
+
+def test_goals_are_imagined_once() -> None:
+    def imagined() -> gym.Env:
+        return ImaginedGoalWrapper(toy.PointEnv(), toy.StraightPredictor(), toy.curriculum())
+
+    batch = ImaginedGoalVecEnv(
+        DummyVecEnv([toy.PointEnv]), toy.StraightPredictor(), toy.curriculum()
+    )
+    for inner in (DummyVecEnv([imagined]), batch, VecMonitor(batch)):
+        with pytest.raises(ValueError, match="the environment imagines goals already: leave one"):
+            ImaginedGoalVecEnv(inner, toy.StraightPredictor(), toy.curriculum())
+    with pytest.raises(ValueError, match="the environment imagines goals already: leave one"):
+        ImaginedGoalWrapper(imagined(), toy.StraightPredictor(), toy.curriculum())
+
+
+def test_a_predictor_of_another_task_is_refused() -> None:
+    predictor, curriculum = toy.StraightPredictor(), toy.Curriculum(50)
+    predictor.horizon, predictor.env_id = 50, "FollowObject/PushSideGap-v0"
+    sentence = "made for env_id 'FollowObject/PushSideGap-v0', not for 'FollowObject/PnPShelf-v0'"
+    with pytest.raises(ValueError, match=sentence):
+        ImaginedGoalVecEnv(make_vec("FollowObject/PnPShelf-v0", 1), predictor, curriculum)
+    with pytest.raises(ValueError, match=sentence):
+        ImaginedGoalWrapper(gym.make("FollowObject/PnPShelf-v0"), predictor, curriculum)
+    predictor.env_id = "FollowObject/PnPShelf-v0"
+    ImaginedGoalVecEnv(make_vec("FollowObject/PnPShelf-v0", 1), predictor, curriculum)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from small_buffers import LazyPointEnv, as_arrays, fill, make_buffer, make_env
 from stable_baselines3 import DDPG, HerReplayBuffer
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from toy import HORIZON, PointEnv, StraightPredictor
 
 from sb3_follow_object.common.array_trees import load_tree, save_tree
@@ -280,9 +280,22 @@ def test_a_state_may_take_the_place_of_more_than_it_holds() -> None:
         np.testing.assert_array_equal(got[key], expected[key])
 
 
-def test_imagined_ratio_needs_the_wrapper() -> None:
+def test_imagined_ratio_needs_the_wrapper_to_learn() -> None:
+    env = make_env()
+    buffer = make_buffer(env, imagined_ratio=0.1)  # as of a model that is loaded to act
     with pytest.raises(ValueError, match="ImaginedGoalVecEnv"):
-        make_buffer(make_env(), imagined_ratio=0.1)
+        buffer.set_env(make_env())
+    with pytest.raises(ValueError, match="ImaginedGoalVecEnv"):
+        fill([buffer], env, 1)
+    assert buffer.pos == 0
+
+
+def test_stacked_goals_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"VecFrameStack .* stacks goals too"):
+        make_buffer(VecFrameStack(make_env(), 2))
+
+
+def test_arguments_out_of_range_are_refused() -> None:
     with pytest.raises(ValueError, match="must lie in"):
         make_buffer(make_env(), moved_ratio=1.5)
     with pytest.raises(ValueError, match=r"moved_priority must be .*, not 'speed'"):

@@ -1,0 +1,222 @@
+"""What moves an object in its task and not in its own scene is refused, in one sentence."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from scenes import KITCHEN
+from test_derived import Tidy
+
+from sb3_follow_object.any_task.derived import derived
+
+pytestmark = pytest.mark.usefixtures("few_resets")
+
+
+class OtherRange(Tidy):
+    """Its drawer comes out by another length in each episode."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        found = super().reset(seed=seed)
+        self.model.joint("rail").range[1] = self.np_random.uniform(0.05, 0.1)
+        return found
+
+
+class OtherAxis(Tidy):
+    """Its drawer comes out another way in each episode."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        found = super().reset(seed=seed)
+        way = self.np_random.uniform(-0.5, 0.5)
+        self.model.joint("rail").axis[:] = np.sin(way), -np.cos(way), 0.0
+        return found
+
+
+class OtherMesh(Tidy):
+    """Its mug is larger or smaller in each episode."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.model.mesh_vert[:] = self.vertices * self.np_random.uniform(0.8, 1.2)
+        return super().reset(seed=seed)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.vertices = self.model.mesh_vert.copy()
+
+
+def with_equality(equality: str) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(
+        KITCHEN.replace("<actuator>", f"<equality>{equality}</equality><actuator>")
+    )
+
+
+class Latched(Tidy):
+    """Its drawer is latched in every other episode."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model = with_equality('<weld name="latch" body1="cabinet" body2="drawer"/>')
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        found = super().reset(seed=seed)
+        self.data.eq_active[0] = (seed or 0) % 2
+        return found
+
+
+class Held(Tidy):
+    """A mocap body pulls the mug, but not before a reset says so."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model = with_equality('<weld body1="puller" body2="mug" active="false"/>')
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        found = super().reset(seed=seed)
+        self.data.eq_active[0] = 1
+        return found
+
+
+class Driven(Tidy):
+    """Its drawer is put where the environment wants it."""
+
+    def step(self, action: np.ndarray) -> Any:
+        self.data.joint("rail").qpos = 0.08
+        return super().step(action)
+
+
+class Blown(Tidy):
+    """A wind blows at its mug."""
+
+    def step(self, action: np.ndarray) -> Any:
+        self.data.xfrc_applied[self.model.body("mug").id, 0] = 0.1
+        return super().step(action)
+
+
+class MovingGoal(Tidy):
+    """Its goal goes on as the robot does."""
+
+    def step(self, action: np.ndarray) -> Any:
+        self.goal = self.goal + np.array([0.0, 0.001, 0.0])
+        return super().step(action)
+
+
+class Above(Tidy):
+    """Its goals are for what is above the mug, however the mug lies."""
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        above = self.data.body("mug").xpos + np.array([0.0, 0.0, 0.1])
+        return {**super()._observation(), "achieved_goal": above}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.data.joint(2).qpos[3:] = 1.0, 0.0, 0.0, 0.0
+        mujoco.mj_forward(self.model, self.data)
+        return self._observation(), {}
+
+
+class EndsAfterFive(Tidy):
+    """Ends once its goal has been held for five steps."""
+
+    held = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.held = 0
+        return super().reset(seed=seed)
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, _, truncated, info = super().step(action)
+        self.held = self.held + 1 if info["is_success"] else 0
+        return obs, reward, self.held == 5, truncated, info
+
+
+class EndsAway(Tidy):
+    """Ends where the arm has turned too far."""
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, _, truncated, info = super().step(action)
+        return obs, reward, bool(abs(self.data.joint("turn").qpos[0]) > 0.02), truncated, info
+
+
+class Unconstrained(Tidy):
+    """Nothing touches anything."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+
+
+class Mistaken(Tidy):
+    """Says once that its mug is elsewhere than it is."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        obs, info = super().reset(seed=seed)
+        achieved = obs["achieved_goal"] + 0.05 * (seed == 30)
+        return {**obs, "achieved_goal": achieved}, info
+
+
+SENTENCES = {
+    Mistaken: r"an episode of the object's own scene begins 87 mm off the task's \(seed 30\)",
+    OtherRange: "joint rail of body drawer has another range in other episodes",
+    OtherAxis: "joint rail of body drawer has another axis in other episodes",
+    OtherMesh: "geom .* of body mug has another mesh in other episodes",
+    Latched: "equality latch of cabinet and drawer is another in other episodes, or off in some",
+    Held: 'the equality that lets puller pull mug is off in the model .* active="true" in the',
+    Driven: r"body drawer is moved by the environment, not by its physics alone \(\d+ mm off after",
+    Blown: "a force is applied to body mug, which the object's scene cannot have",
+    MovingGoal: r"the goal moves within an episode, from \[.*\] to \[.*\]; an imagined goal",
+    Above: "no body moves with the achieved goal",
+    EndsAfterFive: "an episode with the object on its goal ended after 5 of 40 steps; imagined",
+    EndsAway: r"an episode of random actions ended after \d+ of 40 steps; imagined goals need",
+    Unconstrained: "the scene's options disable constraints, and with them contacts",
+}
+for kind in SENTENCES:
+    gym.register(f"{kind.__name__}-v0", kind, max_episode_steps=40, disable_env_checker=True)
+
+
+@pytest.mark.parametrize("kind", SENTENCES, ids=lambda kind: kind.__name__)
+def test_what_the_objects_scene_would_lack_is_refused(kind: type[Tidy]) -> None:
+    env_id = f"{kind.__name__}-v0"
+    with pytest.raises(ValueError, match=f"'{env_id}': .*{SENTENCES[kind]}") as caught:
+        derived(env_id)
+    assert "\n" not in str(caught.value)
+
+
+class Sucking(Tidy):
+    """A mocap body may pull the mug, and does not yet."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model = with_equality('<weld body1="puller" body2="mug" active="false"/>')
+        self.data = mujoco.MjData(self.model)
+
+
+class Dragged(Tidy):
+    """What holds the mug back is not the same for all of its ways and turns."""
+
+    DAMPING = (0.1, 0.2, 0.3, 0.01, 0.02, 0.03)
+
+    def __init__(self) -> None:
+        super().__init__()
+        (first,) = self.model.body("mug").dofadr
+        self.model.dof_damping[first : first + 6] = self.DAMPING
+
+
+for kind in (Sucking, Dragged):
+    gym.register(f"{kind.__name__}-v0", kind, max_episode_steps=40, disable_env_checker=True)
+
+
+def test_what_a_mocap_body_does_not_pull_yet_is_no_robot() -> None:
+    found = derived("Sucking-v0")
+    assert found.object.name == "mug"
+    assert found.robot == ("arm", "puller")
+
+
+def test_each_way_and_turn_of_a_joint_has_its_own_damping() -> None:
+    alone = derived("Dragged-v0").scene.model
+    (first,) = alone.body("mug").dofadr
+    np.testing.assert_array_equal(alone.dof_damping[first : first + 6], Dragged.DAMPING)
