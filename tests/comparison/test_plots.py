@@ -115,9 +115,10 @@ def test_folder_without_validations_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="holds no run"):
         read_curve(tmp_path / "none")
     damaged = run_folder(tmp_path / "damaged", [0.1])
-    (damaged / EVALUATIONS).write_text("env_steps,wall_s,success_rate\n1,2,many\n")
-    with pytest.raises(ValueError, match="is not a file of evaluations"):
-        read_curve(damaged)
+    for text in ("1,2,many\n", "1,2,0.1,,\n2,", "1,2,0.1,,\n2,3,0.2,,,4\n"):
+        (damaged / EVALUATIONS).write_text(f"env_steps,wall_s,success_rate,k_max,episodes\n{text}")
+        with pytest.raises(ValueError, match="is not a file of evaluations"):
+            read_curve(damaged)
 
 
 @pytest.mark.parametrize(
