@@ -107,6 +107,13 @@ def tendon_bodies(model: mujoco.MjModel, tendon: int) -> set[int]:
     return bodies
 
 
+def touchable(model: mujoco.MjModel) -> np.ndarray:
+    """Whether a body, or what it hangs on or carries, has geoms that can touch, bool (nbody,)."""
+    roots = model.body_rootid[model.geom_bodyid[touching_geoms(model)]]
+    found: np.ndarray = np.isin(model.body_rootid, roots)
+    return found
+
+
 def pulled(model: mujoco.MjModel) -> list[tuple[int, int, int]]:
     """Mocap bodies, the body that each is welded or connected to, and the equality that does it."""
     found = []

@@ -62,11 +62,12 @@ def check_goes_on(env: gym.Env, found: Candidate, horizon: int) -> None:
     for held, how in ((True, "with the object on its goal"), (False, "of random actions")):
         obs, _ = env.reset(seed=0)
         goal = np.array(obs["desired_goal"], np.float64)
+        held_at: np.ndarray | None = None
         for step in range(1, horizon):
             action = env.action_space.sample()
             if held:
                 action = np.zeros_like(action)
-                _hold(*physics_of(env), found, goal)
+                held_at = _hold(*physics_of(env), found, goal, held_at)
             _, _, terminated, truncated, _ = env.step(action)
             if terminated or truncated:
                 raise ValueError(
@@ -75,11 +76,37 @@ def check_goes_on(env: gym.Env, found: Candidate, horizon: int) -> None:
                 )
 
 
-def _hold(model: mujoco.MjModel, data: mujoco.MjData, found: Candidate, goal: np.ndarray) -> None:
-    """Put the object on a goal (3,), as near as it can be, at rest."""
-    for joint in _joints_of(model, found.body) * _ROUNDS:
-        _bring(model, data, joint, found, goal)
+def _hold(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    found: Candidate,
+    goal: np.ndarray,
+    held_at: np.ndarray | None,
+) -> np.ndarray:
+    """Put the object on a goal (3,), as near as it can be, at rest.
+
+    Args:
+        model: of the environment.
+        data: its state, which is written to.
+        found: the object.
+        goal: (3,) metres.
+        held_at: what this returned before; None looks for it.
+
+    Returns:
+        The positions of all joints, of which only the object's are of use.
+    """
+    joints = _joints_of(model, found.body)
+    if held_at is None:
+        for joint in joints * _ROUNDS:
+            _bring(model, data, joint, found, goal)
+        held_at = data.qpos.copy()
+    for joint in joints:
+        place, speed = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        n_positions, n_speeds = JOINT_SIZE[int(model.jnt_type[joint])]
+        data.qpos[place : place + n_positions] = held_at[place : place + n_positions]
+        data.qvel[speed : speed + n_speeds] = 0.0
     mujoco.mj_forward(model, data)
+    return held_at
 
 
 def _joints_of(model: mujoco.MjModel, body: int) -> list[int]:
@@ -97,8 +124,7 @@ def _bring(
 ) -> None:
     """Move one of an object's joints to where the object is nearest to a goal (3,)."""
     place, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
-    kinds, speed = mujoco.mjtJoint, int(model.jnt_dofadr[joint])
-    data.qvel[speed : speed + JOINT_SIZE[kind][1]] = 0.0
+    kinds = mujoco.mjtJoint
     mujoco.mj_kinematics(model, data)
     point = _point(data, found)
     if kind == int(kinds.mjJNT_FREE):

@@ -15,6 +15,7 @@ from ..envs.robot_parts import (
     pulled,
     robot_bodies,
     standing,
+    touchable,
     touching_geoms,
 )
 from .effectors import Fingertips
@@ -102,13 +103,14 @@ def observe(env: gym.Env) -> Observed:
         ValueError: there is no MuJoCo simulation in it.
     """
     env.action_space.seed(0)
+    kind = env.observation_space["desired_goal"].dtype  # type: ignore[index]
     rows: list[tuple[np.ndarray, ...]] = []
     episodes: list[int] = []
 
     def keep(obs: dict[str, np.ndarray], episode: int) -> None:
         model, data = physics_of(env)
         now = placed(model, data)
-        goals = (np.array(obs[key], np.float64) for key in ("achieved_goal", "desired_goal"))
+        goals = np.array(obs["achieved_goal"], np.float64), np.array(obs["desired_goal"], kind)
         seen = np.array(obs["observation"], np.float64).ravel()
         frames = data.xmat.reshape(-1, 3, 3).copy()
         later = np.concatenate([now.xpos, now.xmat], axis=1)
@@ -130,9 +132,10 @@ def observe(env: gym.Env) -> Observed:
         episode += 1
         keep(env.step(np.zeros_like(env.action_space.sample()))[0], episode)
     columns = [np.stack(column) for column in zip(*rows, strict=True)]
-    achieved, desired, told, positions, rotations, later, sites = columns
+    achieved, desired, observations, positions, rotations, later, sites = columns
     when, model = np.array(episodes), physics_of(env)[0]
-    return Observed(achieved, desired, told, positions, rotations, later, sites, when, model)
+    told = achieved, desired, observations
+    return Observed(*told, positions, rotations, later, sites, when, model)
 
 
 def check_standing(seen: Observed) -> None:
@@ -177,19 +180,25 @@ def check_passive(env: gym.Env) -> None:
             continue
         pushed = np.abs(data.xfrc_applied).max(axis=1, initial=0.0)
         np.maximum.at(pushed, model.dof_bodyid, np.abs(data.qfrc_applied))
-        touched = _touched(model, data, robot)
+        touched = _touched(model, alone, robot) or _touched(model, data, robot)
         alone.ctrl[:] = data.ctrl
         alone.mocap_pos[:], alone.mocap_quat[:] = data.mocap_pos, data.mocap_quat
-        mujoco.mj_step(model, alone, substeps)
+        for _ in range(substeps):
+            mujoco.mj_step(model, alone)
+            touched = touched or _touched(model, alone, robot)
         places, theirs = (placed(model, each).xpos for each in (alone, data))
         off = np.linalg.norm(places - theirs, axis=1)
+        # A robot that went otherwise had other controls within the step, and may have touched.
+        unknown = touched or off[robot].max(initial=0.0) > _DRIVEN
         for body in _passive_roots(model):
+            if not touchable(model)[body]:
+                continue
             if pushed[body]:
                 raise ValueError(
                     f"a force is applied to body {body_name(model, body)}, which the object's "
                     "scene cannot have"
                 )
-            if off[body] > _DRIVEN and not touched:
+            if off[body] > _DRIVEN and not unknown:
                 raise ValueError(
                     f"body {body_name(model, body)} is moved by the environment, not by its "
                     f"physics alone ({off[body] * 1e3:.0f} mm off after a step), which the "
@@ -204,13 +213,18 @@ def _touched(model: mujoco.MjModel, data: mujoco.MjData, robot: np.ndarray) -> b
 
 
 def _check_welds(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Raise a ValueError where what makes a body the robot's is switched on at resets alone."""
+    """Raise a ValueError where resets switch what says whether a body is the robot's."""
+    switched = copy.copy(model)
     for mocap, body, row in pulled(model):
-        if data.eq_active[row] and not model.eq_active0[row]:
+        now = bool(data.eq_active[row])
+        if now == bool(model.eq_active0[row]):
+            continue
+        switched.eq_active0[row] = now
+        if (robot_bodies(switched) != robot_bodies(model)).any():
             raise ValueError(
-                f"the equality that lets {body_name(model, mocap)} pull {body_name(model, body)} "
-                "is off in the model and switched on at a reset, so that nobody knows whose that "
-                'is: give it active="true" in the model'
+                f"resets switch the equality that lets {body_name(model, mocap)} pull "
+                f"{body_name(model, body)} {'on' if now else 'off'}, so that nobody knows whose "
+                f'that is: give it active="{str(now).lower()}" in the model'
             )
 
 

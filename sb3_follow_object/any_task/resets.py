@@ -17,6 +17,7 @@ from ..envs.robot_parts import (
     equated_bodies,
     robot_bodies,
     standing,
+    touchable,
     touching_geoms,
 )
 from .physics_access import physics_of
@@ -117,8 +118,8 @@ def check_same_shapes(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
     """
     if any(getattr(first, name) != getattr(model, name) for name in _NUMBERS):
         raise ValueError(
-            "its model has other bodies, geoms, joints or equalities in other episodes; the "
-            "object's scene needs the same in all: move what is not wanted out of the way"
+            "its model has other bodies, geoms or joints in other episodes; the object's scene "
+            "needs the same in all: move what is not wanted out of the way"
         )
     _check_hung(first, model)
     _check_joints(first, model)
@@ -130,7 +131,7 @@ def check_same_shapes(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
     if heights[0] != heights[1] or _differing(first, model, "hfield_data").any():
         fields = first.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD)
         _refuse_geoms(first, model, fields, "height field")
-    if first.nmeshvert != model.nmeshvert or not np.array_equal(first.mesh_vert, model.mesh_vert):
+    if not np.array_equal(first.mesh_vert, model.mesh_vert):
         _refuse_geoms(first, model, _other_meshes(first, model), "mesh")
 
 
@@ -139,21 +140,34 @@ def check_same_equalities(
 ) -> None:
     """Raise a ValueError where equalities of what is not the robot's differ between episodes."""
     (model, data), (other, state) = first, now
-    differ = _differing(model, other, "eq_data") | (data.eq_active != state.eq_active)
-    if not differ.any():  # as in most resets
-        return
-    robot = robot_bodies(model)
-    for row in map(int, np.flatnonzero(differ)):
-        bodies = equated_bodies(model, row)
-        if bodies and not robot[bodies].any():
+    if model.neq == other.neq:
+        differ = _differing(model, other, "eq_data") | (data.eq_active != state.eq_active)
+        if not differ.any():  # as in most resets
+            return
+    ours, theirs = _passive_equalities(model, data), _passive_equalities(other, state)
+    for named in {**ours, **theirs}:
+        one, two = (each.get(named, np.zeros(0)) for each in (ours, theirs))
+        if one.shape != two.shape or not np.allclose(one, two, rtol=0.0, atol=_SAME):
             raise ValueError(
-                f"equality {model.equality(row).name or row} of "
-                f"{' and '.join(body_name(model, body) for body in bodies)} is another in other "
-                "episodes, or off in some, which the object's scene cannot follow"
+                f"an equality of {named} is another in other episodes, or off in some, which the "
+                "object's scene cannot follow"
             )
 
 
-_NUMBERS = ("nbody", "ngeom", "nq", "njnt", "neq")
+def _passive_equalities(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, np.ndarray]:
+    """By the names of bodies that are not the robot's: what their equalities are, on or off."""
+    robot = robot_bodies(model)
+    found: dict[str, list[np.ndarray]] = {}
+    for row in range(model.neq):
+        bodies = equated_bodies(model, row)
+        if bodies and not robot[bodies].any():
+            values = np.append(model.eq_data[row], [data.eq_active[row], model.eq_type[row]])
+            names = " and ".join(body_name(model, body) for body in bodies)
+            found.setdefault(names, []).append(values)
+    return {names: np.concatenate(values) for names, values in found.items()}
+
+
+_NUMBERS = ("nbody", "ngeom", "nq", "njnt")
 
 _SHAPES = {
     "type": "geom_type",
@@ -218,9 +232,9 @@ def _check_joints(first: mujoco.MjModel, model: mujoco.MjModel) -> None:
     differ["reference"] = _differing(first, model, "qpos0")[first.jnt_qposadr] & of_one
     if not any(rows.any() for rows in differ.values()):  # as in most resets
         return
-    robot = robot_bodies(first)
+    matter = (touchable(first) & ~robot_bodies(first))[first.jnt_bodyid]
     for what, rows in differ.items():
-        for joint in map(int, np.flatnonzero(rows & ~robot[first.jnt_bodyid])):
+        for joint in map(int, np.flatnonzero(rows & matter)):
             raise ValueError(
                 f"joint {first.joint(joint).name or joint} of body "
                 f"{body_name(first, int(first.jnt_bodyid[joint]))} has another {what} in other "
@@ -240,13 +254,18 @@ _OF_JOINTS = {
 
 def _other_meshes(first: mujoco.MjModel, model: mujoco.MjModel) -> np.ndarray:
     """Which geoms have a mesh with other vertices than the first model's, bool (ngeom,)."""
-    meshes = first.geom_type == int(mujoco.mjtGeom.mjGEOM_MESH)
-    if first.nmeshvert != model.nmeshvert:
-        return meshes
-    moved = np.flatnonzero((first.mesh_vert != model.mesh_vert).any(axis=1))
-    of_vertex = np.searchsorted(first.mesh_vertadr, moved, side="right") - 1
-    differ: np.ndarray = meshes & np.isin(first.geom_dataid, of_vertex)
+    differ = first.geom_type == int(mujoco.mjtGeom.mjGEOM_MESH)
+    for geom in map(int, np.flatnonzero(differ)):
+        differ[geom] = not np.array_equal(_vertices(first, geom), _vertices(model, geom))
     return differ
+
+
+def _vertices(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Of a geom's mesh, (n, 3)."""
+    mesh = int(model.geom_dataid[geom])
+    first = int(model.mesh_vertadr[mesh])
+    vertices: np.ndarray = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+    return vertices
 
 
 def varying_bodies(model: mujoco.MjModel, resets: Resets) -> frozenset[int]:

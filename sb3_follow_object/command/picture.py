@@ -17,10 +17,11 @@ def add_parser(subparsers: Any) -> None:
     picture.add_argument(
         "what",
         choices=list(_ENDINGS),
-        help="tasks: all side by side; imagined: goals of a RUN; story: object alone, imagined "
-        "goals and robot of a RUN, moving",
+        help="tasks: all side by side, or that of --env; imagined: goals of a RUN; story: object "
+        "alone, imagined goals and robot of a RUN, moving",
     )
     picture.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a run")
+    picture.add_argument("--env", metavar="ID", help="of tasks: this one alone")
     picture.add_argument("--seed", type=int, default=0, metavar="N", help="of the episode")
     picture.add_argument("--out", type=Path, metavar="FILE", help="default: WHAT.png or .gif")
 
@@ -35,7 +36,14 @@ def run(args: argparse.Namespace) -> None:
     if (args.run is None) != (args.what == "tasks"):
         wanted = "takes no RUN" if args.what == "tasks" else "needs the folder of a RUN"
         raise ValueError(f"picture {args.what} {wanted}")
-    if args.what == "tasks":
+    if args.env is not None and args.what != "tasks":
+        raise ValueError(f"picture {args.what} takes no --env; a RUN says which task it is of")
+    if args.env is not None:
+        from ..envs.goal_envs import check_task
+        from .pictures import draw_task
+
+        draw_task(check_task(args.env), out, args.seed)
+    elif args.what == "tasks":
         from .pictures import draw_tasks
 
         draw_tasks(out, args.seed)

@@ -156,7 +156,7 @@ def _final_success(groups: Sequence[Group], methods: Sequence[str], tasks: Seque
 
 
 def _across_tasks(groups: Sequence[Group], methods: Sequence[str]) -> Any:
-    """Return performance profiles and sample efficiency over the tasks that all methods ran."""
+    """Return performance profiles and sample efficiency over tasks that methods share."""
     figure, axes = _figure(1, 2)
     tasks, runs = common_runs(groups)
     budgets = _budgets(runs)

@@ -185,27 +185,38 @@ def ordered(known: Iterable[str], found: Iterable[str]) -> list[str]:
 
 
 def common_runs(groups: Sequence[Group]) -> tuple[list[str], dict[str, list[list[Run]]]]:
-    """Return what methods can be compared on: the tasks that all of them have finished runs of.
+    """Return what methods can be compared on: tasks that each of them has finished runs of.
 
-    A method that has not finished a single run does not narrow the choice.
+    Of methods and tasks it is the most that leave no cell empty: methods that ran on few tasks are
+    left out, rather than the tasks that they did not run on. The first method is always there.
 
     Returns:
         The tasks, and by method its finished runs, seed by seed one of each task: as many as it
         has of all of these. Methods come in the groups' order. Empty where no task is common to
-        two or more of them.
+        the first and another.
     """
     finished = {(g.task, g.method): g.of(FINISHED) for g in groups if g.of(FINISHED)}
-    ran = {method for _, method in finished}
+    ran = {method: {task for task, other in finished if other == method} for _, method in finished}
     methods = [method for method in dict.fromkeys(g.method for g in groups) if method in ran]
-    tasks = [
-        task
-        for task in dict.fromkeys(g.task for g in groups)
-        if all((task, method) in finished for method in methods)
-    ]
-    if not tasks or len(methods) < 2:
+    if len(methods) < 2:
         return [], {}
+    first, *others = methods
+    chosen, tasks = [first], ran[first]
+    most: tuple[list[str], set[str]] = [], set()
+    for method in sorted(others, key=lambda method: -len(ran[method] & ran[first])):
+        chosen, tasks = [*chosen, method], tasks & ran[method]
+        if tasks and len(chosen) * len(tasks) >= len(most[0]) * len(most[1]):
+            most = chosen, tasks
+    ordered = [task for task in dict.fromkeys(g.task for g in groups) if task in most[1]]
+    return ordered, _seed_by_seed(finished, ordered, [m for m in methods if m in most[0]])
+
+
+def _seed_by_seed(
+    finished: Mapping[tuple[str, str], Sequence[Run]], tasks: Sequence[str], methods: Sequence[str]
+) -> dict[str, list[list[Run]]]:
+    """Return by method its finished runs, seed by seed one of each task."""
     of_seeds = {m: zip(*(finished[task, m] for task in tasks), strict=False) for m in methods}
-    return tasks, {method: [list(runs) for runs in seeds] for method, seeds in of_seeds.items()}
+    return {method: [list(runs) for runs in seeds] for method, seeds in of_seeds.items()}
 
 
 def success_rates(runs: Sequence[Sequence[Run]]) -> np.ndarray:

@@ -361,7 +361,7 @@ gym.register("Timeless-v0", Tidy, disable_env_checker=True)
             "MovedGeom-v0",
             r"'MovedGeom-v0': geom \d+ of body shelf has another place in other .* give it a body",
         ),
-        ("Rebuilt-v0", "'Rebuilt-v0': its model has other bodies, geoms, joints or equa"),
+        ("Rebuilt-v0", "'Rebuilt-v0': its model has other bodies, geoms or joints in other epis"),
         ("Buttons-v0", r"'Buttons-v0': its actions are Discrete\(3\); the robot is trained with"),
         ("NoPhysics-v0", "'NoPhysics-v0': NoPhysics holds no MuJoCo simulation"),
         ("Timeless-v0", "'Timeless-v0': it does not say how long its episodes are; register it"),

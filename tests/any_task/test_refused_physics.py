@@ -81,6 +81,19 @@ class Held(Tidy):
         return found
 
 
+class Released(Held):
+    """A mocap body pulls the mug, until a reset says that it does not."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model.eq_active0[0] = 1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        found = super().reset(seed=seed)
+        self.data.eq_active[0] = 0
+        return found
+
+
 class Driven(Tidy):
     """Its drawer is put where the environment wants it."""
 
@@ -164,8 +177,9 @@ SENTENCES = {
     OtherRange: "joint rail of body drawer has another range in other episodes",
     OtherAxis: "joint rail of body drawer has another axis in other episodes",
     OtherMesh: "geom .* of body mug has another mesh in other episodes",
-    Latched: "equality latch of cabinet and drawer is another in other episodes, or off in some",
-    Held: 'the equality that lets puller pull mug is off in the model .* active="true" in the',
+    Latched: "an equality of cabinet and drawer is another in other episodes, or off in some",
+    Held: 'resets switch the equality that lets puller pull mug on, .* active="true" in the model',
+    Released: 'resets switch the equality .* pull mug off, .* active="false" in the model',
     Driven: r"body drawer is moved by the environment, not by its physics alone \(\d+ mm off after",
     Blown: "a force is applied to body mug, which the object's scene cannot have",
     MovingGoal: r"the goal moves within an episode, from \[.*\] to \[.*\]; an imagined goal",
@@ -184,6 +198,42 @@ def test_what_the_objects_scene_would_lack_is_refused(kind: type[Tidy]) -> None:
     with pytest.raises(ValueError, match=f"'{env_id}': .*{SENTENCES[kind]}") as caught:
         derived(env_id)
     assert "\n" not in str(caught.value)
+
+
+MARKER = '''
+    <body name="marker" pos="0.5 0 0.5"><freejoint/>
+      <geom size="0.01" mass="0.01" contype="0" conaffinity="0"/>
+    </body>
+    <body name="puller"'''
+
+
+class Stroking(Tidy):
+    """Has a marker at its goal, a goal that rounds, and an arm that strokes there and back."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        scene = KITCHEN.replace('<body name="puller"', MARKER)
+        tie = '<equality><joint joint1="turn" polycoef="0.1 0 0 0 0"/></equality><actuator>'
+        self.model = mujoco.MjModel.from_xml_string(scene.replace("<actuator>", tie))
+        self.data = mujoco.MjData(self.model)
+        arm = self.model.body("arm").geomadr[0]
+        self.model.geom_pos[arm] = 0.2, 0.1, 0.05  # where it comes by the mug
+        goal = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        spaces = dict(self.observation_space.spaces)  # type: ignore[attr-defined]
+        self.observation_space = gym.spaces.Dict({**spaces, "desired_goal": goal})
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        found = super().reset(seed=seed)
+        self.data.eq_active[0] = 0 if seed is None else seed % 2
+        return found
+
+    def step(self, action: np.ndarray) -> Any:
+        for sign in (8.0, -8.0, 0.0):
+            self.data.ctrl[:] = sign
+            mujoco.mj_step(self.model, self.data, 10)
+        self.data.joint(int(self.model.body("marker").jntadr[0])).qpos[:3] = self.goal
+        obs, *others = super().step(np.zeros(1))
+        return {**obs, "desired_goal": obs["desired_goal"] * (1.0 + 1e-15)}, *others
 
 
 class Sucking(Tidy):
@@ -206,8 +256,13 @@ class Dragged(Tidy):
         self.model.dof_damping[first : first + 6] = self.DAMPING
 
 
-for kind in (Sucking, Dragged):
+for kind in (Sucking, Dragged, Stroking):
     gym.register(f"{kind.__name__}-v0", kind, max_episode_steps=40, disable_env_checker=True)
+
+
+def test_what_makes_no_difference_to_the_object_is_not_refused() -> None:
+    found = derived("Stroking-v0")
+    assert found.object.name == "mug" and found.robot == ("arm",)
 
 
 def test_what_a_mocap_body_does_not_pull_yet_is_no_robot() -> None:

@@ -101,10 +101,23 @@ def test_all_tasks_are_drawn_side_by_side(tmp_path: Path) -> None:
     assert Image.open(tmp_path / "tasks.png").size == (4 * 480, 2 * 480)
 
 
+@pytest.mark.usefixtures("can_draw")
+def test_a_task_of_ones_own_is_drawn_alone(tmp_path: Path) -> None:
+    out = tmp_path / "task.png"
+    words = ["--env", "own_tasks:FollowObject/PushPast-v0", "--out", str(out)]
+    assert main(["picture", "tasks", *words]) == 0
+    drawn = np.asarray(Image.open(out)).astype(int)
+    assert drawn.shape == (480, 480, 3)
+    red, _, blue = np.moveaxis(drawn, 2, 0)
+    assert (red > 2 * blue).sum() > 100 < (blue > 2 * red).sum(), "the regions are there"
+
+
 @pytest.mark.parametrize(
     "words, sentence",
     [
         (["tasks", "RUN"], "picture tasks takes no RUN"),
+        (["tasks", "--env", "FollowObject/PnPShlf-v0"], "did you mean 'FollowObject/PnPShelf-v0'"),
+        (["story", "RUN", "--env", TASK], "picture story takes no --env; a RUN says which task"),
         (["story"], "picture story needs the folder of a RUN"),
         (["story", "RUN", "--out", "story.png"], "story.png does not end in .gif"),
         (["imagined", "RUN", "--seed", "-1"], "seed is -1; it must be at least 0"),

@@ -189,6 +189,20 @@ def test_methods_are_compared_on_tasks_that_all_have(tmp_path: Path) -> None:
     np.testing.assert_allclose(success_rates(runs["her"]), [[0.3, 0.0], [0.3, 0.2]])
 
 
+def test_a_method_that_ran_on_few_tasks_does_not_narrow_the_comparison(tmp_path: Path) -> None:
+    tasks = ["PnPObstacle", "PnPShelf", "PushSideGap"]
+    for method, n_tasks in (("fo", 3), ("her", 2), ("rher", 3), ("rnd", 1)):
+        for task in tasks[:n_tasks]:
+            write_run(tmp_path, task, method, 0, 0.5)
+    found, runs = common_runs(group_runs(read_results(tmp_path)))
+    assert sorted(found) == tasks[:2], "three methods on two tasks before two on three"
+    assert list(runs) == ["fo", "her", "rher"]
+    write_run(tmp_path, "PnPSimpleV1", "fo", 0, 0.5)
+    write_run(tmp_path, "PnPSimpleV1", "rher", 0, 0.5)
+    found, runs = common_runs(group_runs(read_results(tmp_path)))
+    assert len(found) == 4 and list(runs) == ["fo", "rher"]
+
+
 def test_table_compares_each_method_with_the_first(tmp_path: Path) -> None:
     for seed, (fo, her) in enumerate([(0.9, 0.5), (0.8, 0.9)]):
         write_run(tmp_path, "PnPShelf", "fo", seed, fo)
