@@ -98,7 +98,6 @@ def followed_space(shape: Sequence[int] | None) -> GoalSpace:
     space = goal_space(shape) if shape else None
     if space is None or space.kind not in KINDS:
         known = " or ".join(each.said for each in KINDS.values())
-        raise ValueError(
-            f"the environment's goals have the shape {shape}; what can be followed are {known}"
-        )
+        what = "are of no single shape" if shape is None else f"have the shape {shape}"
+        raise ValueError(f"the environment's goals {what}; what can be followed are {known}")
     return space

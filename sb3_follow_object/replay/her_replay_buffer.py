@@ -226,7 +226,13 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         """Refuse to begin where imagined goals are asked for and nothing imagines any, too."""
         super().check_first()
         if self.imagined_ratio > 0.0:
-            imagination_of(self.env, IMAGINED_RATIO)
+            try:
+                imagination_of(self.env, IMAGINED_RATIO)
+            except ValueError as error:
+                raise ValueError(
+                    f"{error}; where the model has had another environment since it was made, call "
+                    "model.replay_buffer.set_env(model.env)"
+                ) from error
 
     def _check_asked(self, env: VecEnv) -> None:
         check_copies(self.n_envs, env.num_envs)
