@@ -35,6 +35,12 @@ def robot_roots(model: mujoco.MjModel) -> list[int]:
     return [int(body) for body in roots]
 
 
+def passive_roots(model: mujoco.MjModel) -> list[int]:
+    """Bodies with joints of their own that are not the robot's."""
+    passive = (model.body_jntnum > 0) & ~robot_bodies(model)
+    return [int(body) for body in np.flatnonzero(passive)]
+
+
 def first_jointed(model: mujoco.MjModel, body: int) -> int:
     """The body nearest to the world on the way to this one that has a joint; 0, none has."""
     first = 0

@@ -32,12 +32,11 @@ from .finding import (
     Effector,
     Observed,
     candidates,
-    check_passive,
-    check_standing,
     find_effector,
     find_object,
     observe,
 )
+from .passive import check_passive, check_standing
 from .physics_access import NoSimulation, is_simulated
 from .resets import Resets, record_resets, varying_bodies
 from .scene import DerivedScene, DerivedTask, object_scene_of, physics_digest_of

@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 
 import gymnasium as gym
 import numpy as np
 
 from ..envs.physics_engine import mujoco
-from ..envs.robot_parts import (
-    body_name,
-    carrier,
-    pulled,
-    robot_bodies,
-    standing,
-    touchable,
-    touching_geoms,
-)
+from ..envs.robot_parts import body_name, carrier, passive_roots, robot_bodies
 from .effectors import Fingertips
 from .physics_access import physics_of, placed
 
@@ -26,9 +17,6 @@ TOLERANCE = 1e-3  # metres that a body's fixed point may lie off the achieved go
 _SAME_PLACE = 1e-5  # metres between an effector and what the observation says of it
 _NUDGE = np.array([0.02, -0.03, 0.05])  # metres
 _TURN = np.array([0.3, -0.4, 0.5])  # radians about the axes of what is free or on a ball joint
-_STILL = 1e-5  # metres, and parts of an axis, that what stands may seem to move in a step
-_TRIED = 3  # steps that are done again
-_DRIVEN = 1e-3  # metres that what nobody touches may go otherwise in a step
 _LEAST_MOVED = 1e-3  # metres that a thing must have moved to be told from others
 
 
@@ -126,7 +114,7 @@ def observe(env: gym.Env) -> Observed:
         if ended or truncated:
             obs, _ = env.reset()
             episode += 1
-    for root in _passive_roots(physics_of(env)[0]):
+    for root in passive_roots(physics_of(env)[0]):
         env.reset(seed=0)
         _nudge(*physics_of(env), root)
         episode += 1
@@ -136,96 +124,6 @@ def observe(env: gym.Env) -> Observed:
     when, model = np.array(episodes), physics_of(env)[0]
     told = achieved, desired, observations
     return Observed(*told, positions, rotations, later, sites, when, model)
-
-
-def check_standing(seen: Observed) -> None:
-    """Raise a ValueError where the goal, or what stands and can be touched, moves in an episode."""
-    model = seen.model
-    steps = np.flatnonzero(seen.episodes[1:] == seen.episodes[:-1])
-    for now, later in zip(seen.desired[steps], seen.desired[steps + 1], strict=True):
-        if not np.array_equal(now, later):
-            raise ValueError(
-                f"the goal moves within an episode, from {now.tolist()} to {later.tolist()}; an "
-                "imagined goal belongs to a whole episode"
-            )
-    moved = np.abs(seen.later[steps + 1] - seen.later[steps]).max(axis=(0, 2), initial=0.0)
-    stands = standing(model) & ~robot_bodies(model)
-    touching = np.unique(model.geom_bodyid[touching_geoms(model)])
-    for body in map(int, touching):
-        if stands[body] and moved[body] > _STILL:
-            raise ValueError(
-                f"body {body_name(model, body)} moves within an episode without a joint, which the "
-                "object's scene cannot follow; give it a joint, or let it touch nothing"
-            )
-
-
-def check_passive(env: gym.Env) -> None:
-    """Raise a ValueError where something else than physics moves what is not the robot's.
-
-    A step is done again without the environment: what the robot does not touch moves alike.
-
-    Args:
-        env: is reset and stepped.
-    """
-    for seed in range(_TRIED):
-        env.reset(seed=seed)
-        model, data = physics_of(env)
-        robot = robot_bodies(model)
-        _check_welds(model, data)
-        alone = copy.copy(data)
-        *_, ended, truncated, _ = env.step(env.action_space.sample())
-        again, data = physics_of(env)
-        substeps = round((data.time - alone.time) / model.opt.timestep)
-        if ended or truncated or again is not model or substeps < 1:
-            continue
-        pushed = np.abs(data.xfrc_applied).max(axis=1, initial=0.0)
-        np.maximum.at(pushed, model.dof_bodyid, np.abs(data.qfrc_applied))
-        touched = _touched(model, alone, robot) or _touched(model, data, robot)
-        alone.ctrl[:] = data.ctrl
-        alone.mocap_pos[:], alone.mocap_quat[:] = data.mocap_pos, data.mocap_quat
-        for _ in range(substeps):
-            mujoco.mj_step(model, alone)
-            touched = touched or _touched(model, alone, robot)
-        places, theirs = (placed(model, each).xpos for each in (alone, data))
-        off = np.linalg.norm(places - theirs, axis=1)
-        # A robot that went otherwise had other controls within the step, and may have touched.
-        unknown = touched or off[robot].max(initial=0.0) > _DRIVEN
-        for body in _passive_roots(model):
-            if not touchable(model)[body]:
-                continue
-            if pushed[body]:
-                raise ValueError(
-                    f"a force is applied to body {body_name(model, body)}, which the object's "
-                    "scene cannot have"
-                )
-            if off[body] > _DRIVEN and not unknown:
-                raise ValueError(
-                    f"body {body_name(model, body)} is moved by the environment, not by its "
-                    f"physics alone ({off[body] * 1e3:.0f} mm off after a step), which the "
-                    "object's scene cannot follow; move a body without joints, at resets"
-                )
-
-
-def _touched(model: mujoco.MjModel, data: mujoco.MjData, robot: np.ndarray) -> bool:
-    """Whether the robot touches anything else."""
-    of_robot = robot[model.geom_bodyid[data.contact.geom]]
-    return bool((of_robot[:, 0] != of_robot[:, 1]).any())
-
-
-def _check_welds(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Raise a ValueError where resets switch what says whether a body is the robot's."""
-    switched = copy.copy(model)
-    for mocap, body, row in pulled(model):
-        now = bool(data.eq_active[row])
-        if now == bool(model.eq_active0[row]):
-            continue
-        switched.eq_active0[row] = now
-        if (robot_bodies(switched) != robot_bodies(model)).any():
-            raise ValueError(
-                f"resets switch the equality that lets {body_name(model, mocap)} pull "
-                f"{body_name(model, body)} {'on' if now else 'off'}, so that nobody knows whose "
-                f'that is: give it active="{str(now).lower()}" in the model'
-            )
 
 
 def candidates(seen: Observed) -> list[Candidate]:
@@ -305,12 +203,6 @@ def find_effector(seen: Observed, entries: tuple[int, int, int] | None = None) -
 def _effector(seen: Observed, entries: tuple[int, int, int], tips: np.ndarray) -> Effector:
     told = seen.observations[:, entries]
     return Effector(entries, float(np.linalg.norm(told - tips, axis=1).mean()))
-
-
-def _passive_roots(model: mujoco.MjModel) -> list[int]:
-    """Bodies with joints of their own that are not the robot's."""
-    robot = robot_bodies(model)
-    return [b for b in range(1, model.nbody) if model.body_jntnum[b] and not robot[b]]
 
 
 def _nudge(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> None:

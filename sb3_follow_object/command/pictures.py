@@ -20,6 +20,7 @@ from ..envs import IDS, TASKS
 from ..envs.graphics import find_graphics
 from ..envs.picture import marker_colours
 from ..envs.robot_copies import robot_maker
+from ..envs.task_table import BUILT_IN
 from ..imagination.goal_predictor import GoalPredictor
 from ..imagination.imagined_goals import points_along
 
@@ -68,7 +69,10 @@ def draw_tasks(out: str | os.PathLike[str], seed: int = 0) -> None:
     """
     panels = []
     for name in TASKS:
-        env = make_drawn(f"FollowObject/{name}-v0", show_regions=True)
+        env_id = f"FollowObject/{name}-v0"
+        if env_id not in BUILT_IN:  # somebody's own
+            continue
+        env = make_drawn(env_id, show_regions=True)
         try:
             env.reset(seed=seed)
             panels.append(labelled(frame(env), name))

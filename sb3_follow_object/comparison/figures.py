@@ -177,7 +177,7 @@ def _across_tasks(groups: Sequence[Group], methods: Sequence[str]) -> Any:
     axes[0].set(xlabel="success", ylabel="share of runs above it")
     axes[1].set(xlabel="share of a task's env steps", ylabel="interquartile mean of success")
     figure.suptitle(title if tasks else "no task that two methods finished", fontsize=7)
-    _legend(figure, methods)
+    _legend(figure, methods, drawn=list(runs))
     return figure
 
 
@@ -291,10 +291,16 @@ def _figure(rows: int, columns: int) -> tuple[Any, list[Any]]:
     return figure, list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
 
 
-def _legend(figure: Any, methods: Sequence[str]) -> None:
+def _legend(figure: Any, methods: Sequence[str], drawn: Sequence[str] | None = None) -> None:
+    """Say which method has which colour, of those drawn; None, all and unfinished runs too."""
     lines = need("matplotlib.lines", "plots")
-    handles = [lines.Line2D([], [], color=_color(methods, m), label=m) for m in methods]
-    handles.append(lines.Line2D([], [], color="0.4", linestyle=":", marker=".", label="unfinished"))
+    shown = methods if drawn is None else drawn
+    handles = [lines.Line2D([], [], color=_color(methods, m), label=m) for m in shown]
+    if drawn is None:
+        unfinished = {"color": "0.4", "linestyle": ":", "marker": ".", "label": "unfinished"}
+        handles.append(lines.Line2D([], [], **unfinished))
+    if not handles:
+        return
     longest = max(len(handle.get_label()) for handle in handles)
     fit = max(1, int(figure.get_figwidth() / (0.6 + 0.08 * longest)))  # inches of an entry
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), fit))

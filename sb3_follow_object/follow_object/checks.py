@@ -11,9 +11,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from ..any_task.tasks import object_vec_env, steps_of_object
 from ..common.torch_helpers import usable_device
 from ..ddpg.her_ddpg import HerDDPG
+from ..imagination.vec_env import imagination_of
 from ..object_stage.networks import check_readable
 from ..object_stage.sldr import task_of_package
 from ..reach.approach import check_reachable, reach_first_settings
+from ..replay.her_replay_buffer import IMAGINED_RATIO
 from ..replay.steps import refuse_margin
 from ..settings.fields import settings_of
 from ..settings.learning import PredictorSettings
@@ -49,6 +51,8 @@ def check_algorithms(
         refuse_margin()
     if settings["imagine"] and replay:
         replay["imagined_ratio"] = 0.0
+    elif replay.get("imagined_ratio"):
+        imagination_of(env, IMAGINED_RATIO)
     _check_algorithm(env, horizon, arguments)
     if settings["imagine"] or needs_networks:
         check_object_stage(settings, horizon, needs_networks)

@@ -53,45 +53,45 @@ def with_equality(equality: str) -> mujoco.MjModel:
     )
 
 
-class Latched(Tidy):
+class Tied(Tidy):
+    """Has one more equality, and says at each reset whether it is on."""
+
+    equality = '<weld body1="puller" body2="mug" active="false"/>'
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model = with_equality(self.equality)
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        found = super().reset(seed=seed)
+        self.data.eq_active[0] = self.is_on(seed or 0)
+        return found
+
+    def is_on(self, seed: int) -> bool:
+        return False
+
+
+class Latched(Tied):
     """Its drawer is latched in every other episode."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.model = with_equality('<weld name="latch" body1="cabinet" body2="drawer"/>')
-        self.data = mujoco.MjData(self.model)
+    equality = '<weld name="latch" body1="cabinet" body2="drawer"/>'
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        found = super().reset(seed=seed)
-        self.data.eq_active[0] = (seed or 0) % 2
-        return found
+    def is_on(self, seed: int) -> bool:
+        return seed % 2 == 1
 
 
-class Held(Tidy):
+class Held(Tied):
     """A mocap body pulls the mug, but not before a reset says so."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.model = with_equality('<weld body1="puller" body2="mug" active="false"/>')
-        self.data = mujoco.MjData(self.model)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        found = super().reset(seed=seed)
-        self.data.eq_active[0] = 1
-        return found
+    def is_on(self, seed: int) -> bool:
+        return True
 
 
-class Released(Held):
+class Released(Tied):
     """A mocap body pulls the mug, until a reset says that it does not."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.model.eq_active0[0] = 1
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        found = super().reset(seed=seed)
-        self.data.eq_active[0] = 0
-        return found
+    equality = '<weld body1="puller" body2="mug"/>'
 
 
 class Driven(Tidy):
@@ -236,13 +236,8 @@ class Stroking(Tidy):
         return {**obs, "desired_goal": obs["desired_goal"] * (1.0 + 1e-15)}, *others
 
 
-class Sucking(Tidy):
+class Sucking(Tied):
     """A mocap body may pull the mug, and does not yet."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.model = with_equality('<weld body1="puller" body2="mug" active="false"/>')
-        self.data = mujoco.MjData(self.model)
 
 
 class Dragged(Tidy):

@@ -46,9 +46,11 @@ def test_other_vectors_are_compared_but_not_followed() -> None:
     plane = goal_space((2,))
     assert (plane.kind, plane.size) == ("vector", 2)
     assert plane.distance(np.zeros(2), np.array([0.3, 0.4])) == pytest.approx(0.5)
-    for shape in ((2,), (7,), (1, 3), (), None):
+    for shape in ((2,), (7,), (1, 3), ()):
         with pytest.raises(ValueError, match=r"have the shape .*; what can be followed are pos"):
             followed_space(shape)
+    with pytest.raises(ValueError, match="are of no single shape; what can be followed are pos"):
+        followed_space(None)
 
 
 class Turned(GoalSpace):
