@@ -35,13 +35,15 @@ def check_horizons(predictor: GoalPredictor, curriculum: Curriculum) -> None:
 
 
 def check_made_for(predictor: GoalPredictor, spec: EnvSpec | None) -> None:
-    """Refuse an F_phi that was made for another task than this one of the package's.
+    """Refuse an F_phi of one task of this package for another of them.
 
     Args:
-        predictor: F_phi; one of a task of others may be fitted to anybody's paths.
+        predictor: F_phi; what is not of the package may be fitted to anybody's paths.
         spec: of the environment, where it has one.
     """
-    if spec is not None and spec.id in IDS and predictor.env_id not in ("", spec.id):
+    if spec is None or spec.id == predictor.env_id:
+        return
+    if spec.id in IDS and predictor.env_id in IDS:
         raise ValueError(
             f"The predictor was made for env_id {predictor.env_id!r}, not for {spec.id!r}: fit one "
             "for that task."

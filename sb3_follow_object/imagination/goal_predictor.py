@@ -64,7 +64,6 @@ class GoalPredictor(WholeCopies):
 
     space: GoalSpace = POSITIONS
     context: tuple[str, ...] = ()
-    env_id = ""  # of one that says nothing
 
     def __init__(
         self,

@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.env_util import is_wrapped
 
 from ..any_task.context import read_context
 from ..any_task.tasks import steps_of_object
@@ -90,7 +91,7 @@ class ImaginedGoalWrapper(
             )
         env = with_face(env)
         check_reaches_outside(env.has_wrapper_attr("set_reach"))
-        check_imagines_once(_imagines(env))
+        check_imagines_once(is_wrapped(env, ImaginedGoalWrapper))
         super().__init__(env)
         self._space, self._dtype = checked_goals(env.observation_space, env.has_wrapper_attr)
         self._compute_reward = env.get_wrapper_attr("compute_reward")
@@ -200,15 +201,6 @@ class ImaginedGoalWrapper(
     def _facts(self) -> dict[str, Any]:
         facts = {"original_goal": self._original.copy(), "imagined_level": self._level}
         return {**facts, "context": self._context} if self._context.size else facts
-
-
-def _imagines(env: gym.Env) -> bool:
-    """Whether there is an ImaginedGoalWrapper around an environment."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, ImaginedGoalWrapper):
-            return True
-        env = env.env
-    return False
 
 
 def _find_predictor(source: str | os.PathLike[str], env: gym.Env) -> GoalPredictor:

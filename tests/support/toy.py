@@ -76,6 +76,8 @@ def paths(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 class StraightPredictor(GoalPredictor):
     """Imagines the paths above exactly: what the wrappers show can then be computed."""
 
+    env_id = "Point-v0"
+
     def __init__(self) -> None:
         self.horizon = HORIZON
 
