@@ -6,7 +6,7 @@ import subprocess
 import sys
 import sysconfig
 import venv
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +22,15 @@ def few_copies() -> None:
     import tiny_runs  # not before the line above
 
     tiny_runs.evaluate_in_few_copies()
+
+
+@pytest.fixture(autouse=True)
+def no_tasks_of_other_tests() -> Iterator[None]:
+    """A task that a test registers is not there for the next: some go through all tasks."""
+    yield
+    import registered_tasks  # not before the line above
+
+    registered_tasks.forget_tasks()
 
 
 DRAW_ONE_PICTURE = """

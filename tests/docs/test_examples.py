@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import pytest
 import yaml
 from pages import PAGES, blocks, commands, prose
@@ -17,7 +15,7 @@ from tree import ROOT
 
 from sb3_follow_object.command.cli import _COMMANDS
 from sb3_follow_object.command.cli_options import make_parser
-from sb3_follow_object.envs import IDS, TASKS
+from sb3_follow_object.envs import IDS
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.settings.presets import parse_override, run_config
@@ -25,7 +23,6 @@ from sb3_follow_object.settings.presets import parse_override, run_config
 PYTHON = {block.text: block for block in reversed(blocks()) if block.kind == "python"}
 YAML = [block for block in blocks() if block.kind == "yaml"]
 OURS = commands("sb3-follow-object")
-TASKS_OF_OURS = set(IDS)
 SMALL = {"batch_size": 16, "gradient_steps": 2, "policy_kwargs": {"net_arch": [8]}}
 STAGES = {
     "n_envs": 2,
@@ -38,7 +35,7 @@ STAGES = {
 
 
 @pytest.fixture
-def little(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def little(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An empty folder but for a run's policy, kept predictors, and stages that take a moment."""
     init, fit = FollowObject.__init__, GoalPredictor.fit
 
@@ -60,10 +57,6 @@ def little(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     kept = ROOT / "benchmarks" / "results" / "PnPShelf-fo-0"
     shutil.copy(kept / policy, tmp_path / "runs" / "shelf" / policy)
     monkeypatch.chdir(tmp_path)
-    yield
-    for env_id in set(IDS) - TASKS_OF_OURS:  # a task of one's own
-        TASKS.pop(IDS.pop(env_id)[0].name, None)
-        gym.registry.pop(env_id)
 
 
 @pytest.mark.parametrize("code", PYTHON, ids=lambda code: PYTHON[code].name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,13 @@ import numpy as np
 import pytest
 from cli_runs import TINY
 from gymnasium.utils.env_checker import check_env
+from registered_tasks import forget_tasks
 from tiny_runs import bare_run
 
 from sb3_follow_object.command.cli import main
 from sb3_follow_object.comparison.cells import Settings
 from sb3_follow_object.comparison.grid import plan
 from sb3_follow_object.envs import (
-    IDS,
     TASKS,
     Box,
     FetchVecEnv,
@@ -51,18 +50,9 @@ FAR = Region("gripper", (-0.10, 0.15), (0.10, 0.25))
 
 
 @pytest.fixture
-def own() -> Iterator[Task]:
-    """The task, forgotten again afterwards: other tests go through all ids."""
+def own() -> Task:
     run_config(FULL, method="her")
-    yield TASKS[NAME]
-    forget()
-
-
-def forget() -> None:
-    for env_id in (OWN, object_id(OWN)):
-        gym.registry.pop(env_id)
-        del IDS[env_id]
-    del TASKS[NAME], sys.modules[MODULE]
+    return TASKS[NAME]
 
 
 def test_its_environments_are_like_the_packages(own: Task) -> None:
@@ -189,7 +179,7 @@ def test_commands_train_resume_and_test_it_in_processes_of_their_own(
     small = ["--n-envs", "2", "--threads", "1", "--set", *TINY]
     small += ["keep_last_checkpoint=true"]
     assert main([*train, "--steps", "2200", *small]) == 0
-    forget()
+    forget_tasks()
     done = commands([*train, "--resume", "--steps", "2400"], test)
     assert done.returncode == 0, done.stderr
     assert NAME in done.stdout
@@ -199,7 +189,6 @@ def test_commands_train_resume_and_test_it_in_processes_of_their_own(
 
     # And through Python, where the configuration tells the module.
     assert load_config(run).full_id == FULL
-    forget()
 
 
 def test_a_module_before_the_id_does_not_change_the_kind() -> None:
