@@ -19,6 +19,7 @@ EffectorOf = Callable[[gym.Env], Any]
 
 _GOALS = ("achieved_goal", "desired_goal")
 _FAR = 10.0  # metres, farther than any goal is reached from
+_OFF = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, _FAR)  # metres from a goal, to see what is paid
 
 
 class RobotTask(gym.Wrapper):
@@ -143,20 +144,13 @@ class RobotTask(gym.Wrapper):
     def _find_judge(self, desired: np.ndarray) -> None:
         """Find who says whether goals are reached, and whether of many at once."""
         judge = self._given or _success_method(self.env)
-        pays = None
         if (
             has_method(self.env.get_wrapper_attr, "compute_reward")
             and self._goal is None
             and self._given is None
         ):
-            pays = rewards_on_and_off(self.env, desired)
-            self.shifted = pays == (1.0, 0.0)
-            if pays != (0.0, -1.0) and not self.shifted:
-                raise ValueError(
-                    f"{_name(self.env)} pays {pays[0]:g} on the goal and {pays[1]:g} far from it; "
-                    "the rewards must be 0 and -1, or 1 and 0"
-                )
-        if judge is None and pays is None:
+            self.shifted = pays_one(self.env, desired, _name(self.env))
+        elif judge is None:
             where = "is_success" if self._goal is not None else "compute_reward or is_success"
             raise ValueError(
                 f"{_name(self.env)} does not tell when a goal is reached, by {where}; say it with "
@@ -189,18 +183,38 @@ def needs_face(env: gym.Env) -> bool:
     told = env.step(env.action_space.sample())[4]
     return not (
         "is_success" in told
-        and rewards_on_and_off(env, desired)[1] < 0.0
+        and _paid(env, desired, _FAR) < 0.0
         and _answers_batches(lambda a, d: reward(a, d, {}), desired)
         and _answers_batches(success, desired)
     )
 
 
-def rewards_on_and_off(env: gym.Env, desired: np.ndarray) -> tuple[float, float]:
-    """What an environment's `compute_reward` pays on a goal (3,) and far from it."""
-    reward = env.get_wrapper_attr("compute_reward")
-    pays = (reward(achieved, desired, {}) for achieved in (desired, desired + _FAR))
-    on, off = (one_number(each, "compute_reward") for each in pays)
-    return on + 0.0, off + 0.0  # no minus before a zero
+def pays_one(env: gym.Env, desired: np.ndarray, who: str) -> bool:
+    """Whether `compute_reward` pays 1 on a goal and 0 elsewhere, rather than 0 and -1.
+
+    Args:
+        env: has `compute_reward`.
+        desired: a goal (3,).
+        who: beginning of the sentence about other rewards.
+
+    Raises:
+        ValueError: it pays otherwise, on the goal or at some distance from it.
+    """
+    on, pays = _paid(env, desired, 0.0), {off: _paid(env, desired, off) for off in _OFF}
+    if on not in (0.0, 1.0) or pays[_FAR] != on - 1.0 or not {*pays.values()} <= {on, on - 1.0}:
+        off = next((off for off in _OFF if pays[off] not in (on, on - 1.0)), _FAR)
+        raise ValueError(
+            f"{who} pays {on:g} on the goal and {pays[off]:g} at {off:g} m from it; the rewards "
+            "must be 0 and -1, or 1 and 0"
+        )
+    return on == 1.0
+
+
+def _paid(env: gym.Env, desired: np.ndarray, off: float) -> float:
+    """What an environment's `compute_reward` pays so far from a goal (3,), in metres."""
+    achieved = desired + off / np.sqrt(np.size(desired))
+    reward = env.get_wrapper_attr("compute_reward")(achieved, desired, {})
+    return one_number(reward, "compute_reward") + 0.0  # no minus before a zero
 
 
 def _success_method(env: gym.Env) -> Judge | None:

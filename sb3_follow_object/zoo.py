@@ -17,6 +17,7 @@ from typing import Any
 
 from .common.extras import need
 from .ddpg.her_ddpg import HerDDPG
+from .envs.registration import import_task
 from .settings.fields import check_names
 from .settings.presets import preset_file
 from .settings.zoo_yaml import read_yaml
@@ -152,6 +153,7 @@ def _check(arguments: Sequence[str]) -> argparse.Namespace:
     store_dict = need("rl_zoo3.utils", "zoo").StoreDict
     parser = argparse.ArgumentParser(PROGRAM, add_help=False, allow_abbrev=False)
     parser.add_argument("--algo", default=ALGORITHM)
+    parser.add_argument("--env")
     for names in (["-params", "--hyperparams"], ["--env-kwargs"], ["--eval-env-kwargs"]):
         parser.add_argument(*names, nargs="+", action=store_dict)
     parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
@@ -235,7 +237,9 @@ def _run(command: str, arguments: Sequence[str]) -> None:
         defaults += ["--conf-file", str(preset_file("fo"))]
     if command in ("enjoy", "load_from_hub"):
         _tell_missing_files()
-    sys.argv = [f"{PROGRAM} {command}", *defaults, *arguments]
+    # rl_zoo3 knows ids that are registered by now, without a module's name.
+    env = [] if given.env is None else ["--env", import_task(given.env)]
+    sys.argv = [f"{PROGRAM} {command}", *defaults, *arguments, *env]
     runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
 
 

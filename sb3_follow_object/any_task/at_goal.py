@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ..common.answers import one_each
+from ..common.answers import one_each, one_number
 from ..envs.goal_envs import success_method
 from ..envs.physics_engine import mujoco
 from ..envs.transcription import JOINT_SIZE
@@ -51,13 +51,16 @@ def success_distance(env: gym.Env, goals: np.ndarray) -> float:
     return nearest
 
 
-def check_goes_on(env: gym.Env, found: Candidate, horizon: int) -> None:
-    """Raise a ValueError where an episode ends early, one at random or with the object at its goal.
+def check_episodes(env: gym.Env, found: Candidate, horizon: int) -> None:
+    """Watch two whole episodes, one at random and one with the object at its goal.
 
     Args:
-        env: is reset and stepped, for two whole episodes.
+        env: is reset and stepped.
         found: the object.
         horizon: T, after which every episode ends.
+
+    Raises:
+        ValueError: one ends early, or a step pays what `compute_reward` does not.
     """
     for held, how in ((True, "with the object on its goal"), (False, "of random actions")):
         obs, _ = env.reset(seed=0)
@@ -68,12 +71,28 @@ def check_goes_on(env: gym.Env, found: Candidate, horizon: int) -> None:
             if held:
                 action = np.zeros_like(action)
                 held_at = _hold(*physics_of(env), found, goal, held_at)
-            _, _, terminated, truncated, _ = env.step(action)
+            obs, reward, terminated, truncated, info = env.step(action)
+            _check_paid(env, obs, reward, info)
             if terminated or truncated:
                 raise ValueError(
                     f"an episode {how} ended after {step} of {horizon} steps; imagined goals need "
                     "episodes that go on to their time limit: turn that off in the environment"
                 )
+
+
+def _check_paid(
+    env: gym.Env, obs: dict[str, np.ndarray], reward: Any, info: dict[str, Any]
+) -> None:
+    """Raise a ValueError where hindsight would pay a step otherwise than the environment has."""
+    judge = env.get_wrapper_attr("compute_reward")
+    judged = judge(obs["achieved_goal"], obs["desired_goal"], info)
+    paid, told = one_number(reward, "step"), one_number(judged, "compute_reward")
+    if paid != told:
+        raise ValueError(
+            f"a step pays {paid:g} where compute_reward says {told:g} of the same goals, and "
+            "hindsight mixes both: pay compute_reward alone, or say with is_success= when a goal "
+            "is reached"
+        )
 
 
 def _hold(

@@ -22,10 +22,10 @@ from ..envs.goal_space import followed_space
 from ..envs.physics_engine import mujoco
 from ..envs.registration import import_task, registration_key
 from ..envs.robot_copies import robot_maker
-from ..envs.robot_face import RobotTask, rewards_on_and_off
+from ..envs.robot_face import RobotTask, pays_one
 from ..envs.robot_parts import body_name, robot_roots
 from ..envs.robotics import check_robotics
-from .at_goal import check_goes_on, success_distance
+from .at_goal import check_episodes, success_distance
 from .context import context_of
 from .finding import (
     Candidate,
@@ -140,6 +140,9 @@ def _look(env_id: str, report: Report) -> Derived:
             "--method her"
         ) from error
     except ValueError as error:
+        said = str(error)
+        if said.startswith(f"{env_id} "):
+            raise ValueError(said.replace(env_id, repr(env_id), 1)) from error
         raise ValueError(f"{env_id!r}: {error}") from error
     except Exception as error:  # an environment of somebody's may raise anything
         raise raised_by(env_id, error) from error
@@ -170,17 +173,12 @@ def _look_at(env_id: str, env: gym.Env, report: Report) -> Derived:
     horizon = _horizon(env)
     followed_space(env.observation_space["desired_goal"].shape)  # type: ignore[index]
     few, model, data = record_resets(env, _FEW)
-    on, off = rewards_on_and_off(env, few.goals[0])
-    if (on, off) != (0.0, -1.0):
-        raise ValueError(
-            f"it pays {on:g} on the goal and {off:g} far from it; the rewards must be 0 and -1, or "
-            "1 and 0"
-        )
+    pays_one(env, few.goals[0], "it")
     seen = observe(env)
     check_standing(seen)
     check_passive(env)
     found = find_object(seen, _named_object(env))
-    check_goes_on(env, found, horizon)
+    check_episodes(env, found, horizon)
     within = success_distance(env, few.goals[:5])
     again, model_again, _ = record_resets(env, 2)
     repeated, unrepeated = _repeated(few, again, sorted(varying_bodies(model, few)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, cast
 
 import numpy as np
@@ -25,6 +26,12 @@ from .env_copies import copies_for_tests
 from .rollout import Observation, OnStep, check_hears_rollouts, noise_free, run_episodes
 
 _ASKER = "CurriculumCallback"
+_BY_LIMIT = "TimeLimit.truncated"  # what SB3's copies say of an episode that has ended
+_ENDED_EARLY = (
+    "an episode was terminated, not ended by its time limit: imagined goals are for episodes that "
+    "go on, and at -1 a step a robot learns to end what it cannot reach; turn that off in the "
+    "environment"
+)
 
 
 class CurriculumCallback(CopyableCallback):
@@ -89,6 +96,7 @@ class CurriculumCallback(CopyableCallback):
         self._cycles = 0
         self._ended = 0  # episodes of the cycle that goes on
         self._is_training = False
+        self._warned = False  # of episodes that end by themselves
         self._trained: BaseAlgorithm | None = None  # the model that training began with last
 
     @property
@@ -185,7 +193,13 @@ class CurriculumCallback(CopyableCallback):
             end_running_episodes(self._replay_buffer)
 
     def _on_step(self) -> bool:
-        self._ended += int(np.sum(self.locals["dones"]))
+        dones, infos = self.locals["dones"], self.locals["infos"]
+        self._ended += int(np.sum(dones))
+        if not self._warned and any(dones):
+            pairs = zip(dones, infos, strict=True)
+            self._warned = any(done and info.get(_BY_LIMIT) is False for done, info in pairs)
+            if self._warned:
+                warnings.warn(_ENDED_EARLY, stacklevel=2)
         return True
 
     def _on_rollout_end(self) -> None:

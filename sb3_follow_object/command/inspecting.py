@@ -22,6 +22,7 @@ from ..envs.task_table import BUILT_IN
 from ..imagination.goal_predictor import GoalPredictor
 from ..replay.steps import check_actions
 from ..runs.predictor_cache import kept_predictor
+from ..settings.stages import ReachFirstSettings
 from .pictures import imagined_panels, write_png
 
 _SECONDS = 1.0  # that a speed is measured for
@@ -31,6 +32,7 @@ _STEPS = 10  # of one action, in the second half of which its speed is measured
 _BUSY = 0.8  # of an episode's steps on the straight way leave too few for what lies in it
 _SHOWN = 60  # starts and goals in the picture
 _EPISODES = 3  # whose imagined goals are drawn beside them
+_TELL_IT = "effector=fingertips of RobotTask or FollowObject tells where they are"
 
 
 def inspect(env_id: str, report: Report) -> dict[str, str]:
@@ -153,10 +155,11 @@ def _robot(found: Derived) -> str:
 
 def _effector(found: Derived) -> str:
     if found.effector is None:
-        return "not told in the observation"
+        return f"not told in the observation; {_TELL_IT}"
     first, _, last = found.effector.entries
-    off = found.effector.off * 1e3
-    return f"observation[{first}:{last + 1}], {off:.0f} mm off the fingertips' middle"
+    off = found.effector.off
+    told = f"observation[{first}:{last + 1}], {off * 1e3:.0f} mm off the fingertips' middle"
+    return told + f"; {_TELL_IT}" * (off > ReachFirstSettings.tolerance)
 
 
 def _speed(found: Derived) -> str:

@@ -31,6 +31,28 @@ class Dense(Tidy):
         return -np.linalg.norm(achieved - desired, axis=-1)
 
 
+class Saturating(Tidy):
+    """Pays a distance that is -1 where it is far."""
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        return -np.tanh(10.0 * np.linalg.norm(achieved - desired, axis=-1))
+
+
+class PaysForActions(Tidy):
+    """Its steps pay more than its `compute_reward` knows of."""
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward - 0.25, terminated, truncated, info
+
+
+class NoJudge(Tidy):
+    compute_reward = is_success = None  # type: ignore[assignment]
+
+    def step(self, action: np.ndarray) -> Any:
+        return self._observation(), 0.0, False, False, {}
+
+
 class Posed(Tidy):
     def __init__(self) -> None:
         super().__init__()
@@ -309,6 +331,9 @@ class Raises(Tidy):
 KINDS = (
     Massless,
     Dense,
+    Saturating,
+    PaysForActions,
+    NoJudge,
     Posed,
     NoPhysics,
     EndsThere,
@@ -338,7 +363,13 @@ gym.register("Timeless-v0", Tidy, disable_env_checker=True)
     ("env_id", "sentence"),
     [
         ("Massless-v0", "'Massless-v0': the object 'mug' has no mass, so nothing can pull it"),
-        ("Dense-v0", "'Dense-v0': it pays -?0 on the goal and -17.3205 far from it; the rewards"),
+        ("Dense-v0", "'Dense-v0': it pays 0 on the goal and -0.001 at 0.001 m from it; the rewa"),
+        ("Saturating-v0", "pays 0 on the goal and -0.009.* at 0.001 m from it; the rewards must"),
+        (
+            "PaysForActions-v0",
+            "a step pays -0.25 where compute_reward says 0 of the same goals, and hindsight mixes",
+        ),
+        ("NoJudge-v0", "^'NoJudge-v0' does not tell when a goal is reached, by compute_reward or"),
         (
             "Posed-v0",
             r"'Posed-v0': the environment's goals have the shape \(7,\); .* positions",

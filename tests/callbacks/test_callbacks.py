@@ -105,6 +105,26 @@ def test_a_cycle_is_as_many_episodes_as_copies_however_they_end() -> None:
     assert ended / N / 2 <= tests <= ended / N, "not one wherever any copy's episode has ended"
 
 
+class Falls(toy.PointEnv):
+    """Its episodes are over half-way."""
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, _, truncated, info = super().step(action)
+        return obs, reward, self.steps == toy.HORIZON // 2, truncated, info
+
+
+@pytest.mark.parametrize(("kind", "n"), [(toy.PointEnv, 0), (Falls, 1)])
+def test_episodes_that_end_by_themselves_are_told_once(kind: Any, n: int) -> None:
+    curriculum = toy.curriculum()
+    callback = CurriculumCallback(imagining(curriculum, "test"), N)
+    env = ImaginedGoalVecEnv(DummyVecEnv([kind] * N), toy.StraightPredictor(), curriculum)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        learner(env, train_freq=1).learn(4 * N * toy.HORIZON, callback=callback)
+    told = [str(each.message) for each in caught if "was terminated, not" in str(each.message)]
+    assert len(told) == n
+
+
 def test_stacked_goals_are_refused() -> None:
     curriculum = toy.curriculum()
     model = learner(VecFrameStack(imagining(curriculum), 2))

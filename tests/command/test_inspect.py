@@ -52,6 +52,24 @@ def test_it_says_what_is_found(capsys: pytest.CaptureFixture[str]) -> None:
     assert "where 60 episodes of ArmAndWall-v0 begin is recorded, once" in told.err
 
 
+class Silent(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
+    """Its observations do not tell where the stick's end is."""
+
+    def _observation(self) -> Any:
+        now = super()._observation()
+        return {**now, "observation": np.concatenate([np.zeros(3), now["observation"][3:]])}
+
+
+gym.register("Silent-v0", Silent, max_episode_steps=50)
+
+
+def test_it_says_how_to_tell_an_effector(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", "--env", "Silent-v0"]) == 0
+    remedy = "effector=fingertips of RobotTask or FollowObject tells where they are"
+    told = capsys.readouterr().out
+    assert re.search(f"^effector .*; {remedy}$", told, re.MULTILINE)
+
+
 class Reusing(arm_and_wall.ArmAndWall):  # type: ignore[name-defined, misc]
     """Gives the same arrays with each observation."""
 

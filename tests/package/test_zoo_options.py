@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import gymnasium_robotics  # noqa: F401  (registers the ids)
 import numpy as np
 import pytest
 import yaml
@@ -20,6 +21,7 @@ from tiny import HORIZON, TASK, cache_predictor
 from tree import PACKAGES
 
 from sb3_follow_object import zoo
+from sb3_follow_object.envs import registration
 from sb3_follow_object.runs.predictor_cache import CACHE_VARIABLE
 
 pytest.importorskip("rl_zoo3")
@@ -73,6 +75,21 @@ def folder(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     shutil.copytree(trained, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name"),
+    [("own_tasks:FollowObject/PushPast-v0", "FollowObject-PushPast-v0"), ("FetchPush-v4",) * 2],
+)
+def test_ids_of_others_are_known_to_the_door(
+    env_id: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robotics = {"FetchPush-v4": gym.spec("FetchPush-v4")}
+    monkeypatch.delitem(gym.registry, "FetchPush-v4")
+    monkeypatch.setattr(registration, "import_robotics", lambda: gym.registry.update(robotics))
+    (folder / "few.yml").write_text(yaml.safe_dump({"default": {**SETTINGS, "n_timesteps": 100}}))
+    zoo_exits(0, "train", "--env", env_id, "--conf-file", "few.yml", "--eval-freq", "-1")
+    assert (folder / "logs" / "her_ddpg" / f"{name}_1" / f"{name}.zip").exists()
 
 
 def test_train_saves_what_it_is_asked_to(trained: Path) -> None:
