@@ -17,15 +17,18 @@ import importlib.metadata
 import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium as gym
-import gymnasium_robotics
 import numpy as np
 import torch as th
 from stable_baselines3 import DDPG, HerReplayBuffer
@@ -36,6 +39,7 @@ import sb3_follow_object
 from sb3_follow_object.common.files import atomic_write
 from sb3_follow_object.ddpg.her_ddpg import HerDDPG
 from sb3_follow_object.envs import make_vec
+from sb3_follow_object.envs.registration import import_task
 from sb3_follow_object.envs.robot_copies import robot_vec_env
 from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
 from sb3_follow_object.settings.presets import preset_file
@@ -48,6 +52,8 @@ ROBOT, OBJECT, ORIGINAL = (
     "FollowObject/PnPSimpleV1Object-v0",
     "FetchPickAndPlace-v4",
 )
+OF_ROBOTICS = f"gymnasium_robotics:{ORIGINAL}"
+ARM = "arm_and_wall:ArmAndWall-v0"
 OF_OTHERS = 16  # copies of an environment that is not this package's
 HIDDEN = [256, 256, 256]
 PACKAGES = ("sb3-follow-object", "stable-baselines3", "gymnasium", "gymnasium-robotics", "mujoco")
@@ -93,15 +99,22 @@ def envpool_rate(n_envs: int, n_steps: int) -> Measure:
     return measure
 
 
-def _make_original() -> gym.Env:
-    gym.register_envs(gymnasium_robotics)
-    return gym.make(ORIGINAL)
+@contextmanager
+def tutorial_module() -> Iterator[None]:
+    """Have the listing of docs/tutorials/own_robot.md as a module, here and in new processes."""
+    text = (HERE.parent / "docs" / "tutorials" / "own_robot.md").read_text()
+    (code,) = (part for part in text.split("```") if "class ArmAndWall" in part)
+    with TemporaryDirectory() as folder:
+        (Path(folder) / "arm_and_wall.py").write_text(code.removeprefix("python\n"))
+        sys.path.append(folder)
+        yield
+        sys.path.remove(folder)
 
 
 def simulation() -> Iterator[Figure]:
     """Robot and object environments, all cores."""
     n_steps = 100  # two episodes: every copy resets twice
-    subproc = SubprocVecEnv([_make_original] * (2 * CORES))
+    subproc = SubprocVecEnv([partial(gym.make, OF_ROBOTICS)] * (2 * CORES))
     baselines = {
         "EnvPool FetchPickAndPlace-v4": envpool_rate(32, n_steps),
         "SubprocVecEnv FetchPickAndPlace-v4": vec_env_rate(subproc, n_steps),
@@ -109,16 +122,18 @@ def simulation() -> Iterator[Figure]:
     ours = vec_env_rate(make_vec(ROBOT, 32, CORES), n_steps)
     yield "robot simulation", "env steps/s", ours, baselines
     subproc.close()
-    copies = robot_vec_env(ORIGINAL, OF_OTHERS, CORES)
-    subproc = SubprocVecEnv([_make_original] * OF_OTHERS)
-    yield (
-        f"{OF_OTHERS} copies of {ORIGINAL} itself",
-        "env steps/s",
-        vec_env_rate(copies, n_steps),
-        {"SubprocVecEnv": vec_env_rate(subproc, n_steps)},
-    )
-    copies.close()
-    subproc.close()
+    with tutorial_module():
+        for env_id, name in ((OF_ROBOTICS, f"{ORIGINAL} itself"), (ARM, "the tutorial's arm")):
+            copies = robot_vec_env(import_task(env_id), OF_OTHERS, CORES)
+            subproc = SubprocVecEnv([partial(gym.make, env_id)] * OF_OTHERS)
+            yield (
+                f"{OF_OTHERS} copies of {name}",
+                "env steps/s",
+                vec_env_rate(copies, n_steps),
+                {"SubprocVecEnv": vec_env_rate(subproc, n_steps)},
+            )
+            copies.close()
+            subproc.close()
     yield (
         "object simulation",
         "env steps/s",
