@@ -51,7 +51,13 @@ KEPT = ("config.json", "result.json", "versions.json", "evaluations.csv", CROSS_
 WITH_POLICY = ("fo", "rher")
 PREDICTOR = "predictor"
 ENOUGH = 0.9
-NAMES = {"fo": "FO", "her": "HER", "rher": "HER + reaching", "fo-sldr": "FO + SLDR"}
+NAMES = {
+    "fo": "FO",
+    "her": "HER",
+    "rher": "HER + reaching",
+    "shaped": "Shaped",
+    "fo-sldr": "FO + SLDR",
+}
 # The curves of the docs, of all seeds.
 FEATURED = {"PnPSimpleV2": "pnp-simple-v2.png", "PnPShelf": "pnp-shelf.png"}
 COMPARED = ("fo", "rher", "her")
