@@ -71,7 +71,8 @@ def test_card_tells_the_hub_what_it_shows(hub: Path) -> None:
 
 def test_card_tells_what_trained_a_run_that_is_not_finished(copied: Path, tmp_path: Path) -> None:
     """A command where one is noted; else one with what the command line needs no --set for."""
-    config = run_config(TASK, method="her", seed=7, overrides={"n_timesteps": 900})
+    few = {"n_timesteps": 900, "n_final_episodes": 4}
+    config = run_config(TASK, method="her", seed=7, overrides=few)
     (copied / "config.json").write_text(json.dumps(dataclasses.asdict(config)))
     noted = "sb3-follow-object train --method her --set gamma=0.9"
     cards = []
