@@ -107,8 +107,10 @@ def tutorial_module() -> Iterator[None]:
     with TemporaryDirectory() as folder:
         (Path(folder) / "arm_and_wall.py").write_text(code.removeprefix("python\n"))
         sys.path.append(folder)
-        yield
-        sys.path.remove(folder)
+        try:
+            yield
+        finally:
+            sys.path.remove(folder)
 
 
 def simulation() -> Iterator[Figure]:

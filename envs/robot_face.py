@@ -200,13 +200,15 @@ def pays_one(env: gym.Env, desired: np.ndarray, who: str) -> bool:
     Raises:
         ValueError: it pays otherwise, on the goal or at some distance from it.
     """
-    on, pays = _paid(env, desired, 0.0), {off: _paid(env, desired, off) for off in _OFF}
-    if on not in (0.0, 1.0) or pays[_FAR] != on - 1.0 or not {*pays.values()} <= {on, on - 1.0}:
-        off = next((off for off in _OFF if pays[off] not in (on, on - 1.0)), _FAR)
-        raise ValueError(
-            f"{who} pays {on:g} on the goal and {pays[off]:g} at {off:g} m from it; the rewards "
-            "must be 0 and -1, or 1 and 0"
-        )
+    on = _paid(env, desired, 0.0)
+    for off in _OFF:
+        paid = _paid(env, desired, off)
+        allowed = (on - 1.0,) if off == _FAR else (on, on - 1.0)
+        if on not in (0.0, 1.0) or paid not in allowed:
+            raise ValueError(
+                f"{who} pays {on:g} on the goal and {paid:g} at {off:g} m from it; the rewards "
+                "must be 0 and -1, or 1 and 0"
+            )
     return on == 1.0
 
 
