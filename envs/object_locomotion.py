@@ -23,8 +23,14 @@ class ObjectSimulation(BatchedSimulation):
         self._target_pos[:] = self.read["welded_pos"] + actions[:, :3] * MAX_DISPLACEMENT
         self._target_quat[:] = self.read["welded_quat"] + actions[:, 3:] * MAX_DISPLACEMENT
         if self.on_table:
+            self._keep_on_surface()
             self._target_pos[:, 2] = self.scene.landmarks.rest_height
             self._target_quat[:, 1:3] = 0.0  # upright: turned about the vertical only
+
+    def _keep_on_surface(self) -> None:
+        """Pull no object over the edge of what it lies on."""
+        low, high = self.scene.surface
+        np.clip(self._target_pos[:, :2], low, high, out=self._target_pos[:, :2])
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
         """Position, Euler angles, linear and angular velocity (n_envs, 12), and positions."""
@@ -42,8 +48,8 @@ class ObjectEnv(SingleEnv):
 
     Args:
         task: key in `TASKS`, or a row of one's own.
-        on_table: whether the object may not leave the table, so that its paths are those of an
-            object that is pushed. The paper's object may.
+        on_table: whether the object may not leave the table, neither upwards nor over its edge, so
+            that its paths are those of an object that is pushed. The paper's object may.
         reward_type: "sparse" (0 within 0.05 m of the goal, else -1) or "dense" (minus metres).
         render_mode: None, "rgb_array" or "human".
         show_regions: draw where start and goal come from.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from .physics_engine import mujoco
+from .surface import no_edge, surface_bounds
 from .tasks import SUCCESS_DISTANCE, Box, Landmarks, Task
 from .transcription import transcribe
 
@@ -83,6 +84,8 @@ class Scene:
         landmarks: points that the task's samplers refer to.
         substeps: of the physics in an env step of 0.04 s.
         success_distance: metres within which a goal is reached.
+        surface: lowest and highest x and y of an object that stays on the table, (2, 2) metres;
+            of the object's own scene.
     """
 
     task: Task
@@ -94,6 +97,7 @@ class Scene:
     landmarks: Landmarks
     substeps: int = N_SUBSTEPS
     success_distance: float = SUCCESS_DISTANCE
+    surface: np.ndarray = field(default_factory=no_edge)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
         return self
@@ -126,7 +130,12 @@ def object_scene(task: Task) -> Scene:
     model = _object_alone(fetch_spec(task).compile())
     start = robot.model.joint(f"{OBJECT}:joint").qposadr[0]
     qpos = robot.qpos[start : start + 7].copy()
-    return Scene(task, True, model, qpos, np.zeros(model.nv), 0.0, robot.landmarks)
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    surface = surface_bounds(model, data, int(model.body(OBJECT).id))
+    still = np.zeros(model.nv)
+    return Scene(task, True, model, qpos, still, 0.0, robot.landmarks, surface=surface)
 
 
 def _object_alone(whole: mujoco.MjModel) -> mujoco.MjModel:
@@ -193,11 +202,11 @@ def physics_digest(task: Task) -> str:
         "geom_margin geom_solref geom_solimp dof_damping eq_data eq_solref eq_solimp"
     )
     parts = [repr(task), str(N_SUBSTEPS), f"{model.opt.timestep:.9g}", str(model.opt.gravity)]
-    for field in fields.split():
-        values = np.asarray(getattr(model, field), dtype=np.float64)
-        if field == "eq_data":
+    for name in fields.split():
+        values = np.asarray(getattr(model, name), dtype=np.float64)
+        if name == "eq_data":
             values = values[:, :_EQ_DATA]
-        parts.append(field + " ".join(f"{value:.9g}" for value in values.ravel()))
+        parts.append(name + " ".join(f"{value:.9g}" for value in values.ravel()))
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from ..envs.physics_engine import mujoco
 from ..envs.robot_parts import rigid_group
 from ..envs.scene import weld_to
+from ..envs.surface import no_edge, surface_bounds
 from ..envs.transcription import JOINT_SIZE, Transcription, transcribe
 from .resets import Resets, varying_bodies
 
@@ -76,6 +77,8 @@ class DerivedScene:
         substeps: of the physics in an env step of 0.04 s.
         success_distance: metres within which a goal is reached.
         context: what episodes differ in beside start and goal, by the names of `context_of`.
+        surface: lowest and highest x and y of the welded body while it stays on its surface, (2, 2)
+            metres; infinite where no edge is known, or goals lie beyond it.
     """
 
     task: DerivedTask
@@ -88,6 +91,7 @@ class DerivedScene:
     substeps: int
     success_distance: float
     context: tuple[str, ...] = ()
+    surface: np.ndarray = field(default_factory=no_edge)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> DerivedScene:
         return self
@@ -144,7 +148,8 @@ def object_scene_of(
         context,
     )
     _check_starts(scene, resets)
-    return scene
+    around = success_distance + float(np.linalg.norm(offset))
+    return replace(scene, surface=_surface(scene, resets.goals[:, :2], around))
 
 
 def physics_digest_of(
@@ -245,6 +250,19 @@ def _standing(alone: mujoco.MjModel, copied: Transcription, resets: Resets) -> n
         mocap = int(alone.body_mocapid[alone.body(copied.bodies[body]).id])
         places[:, mocap] = resets.places[:, body]
     return places
+
+
+def _surface(scene: DerivedScene, goals: np.ndarray, around: float) -> np.ndarray:
+    """Bounds of what the object lies on, unless episodes begin or have goals (n, 2) beyond them."""
+    data, starts = mujoco.MjData(scene.model), np.empty((len(goals), 2))
+    for episode in reversed(range(len(goals))):  # the first one is looked at last
+        data.qpos[:] = scene.qpos[episode]
+        mujoco.mj_kinematics(scene.model, data)
+        starts[episode] = data.xpos[scene.welded, :2]
+    bounds = surface_bounds(scene.model, data, scene.welded)
+    within = (bounds[0] <= starts) & (starts <= bounds[1])
+    reached = (bounds[0] - around <= goals) & (goals <= bounds[1] + around)
+    return bounds if within.all() and reached.all() else no_edge()
 
 
 def _check_starts(scene: DerivedScene, resets: Resets) -> None:

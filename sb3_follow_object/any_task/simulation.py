@@ -61,6 +61,7 @@ class DerivedSimulation(ObjectSimulation):
         self._target_pos[:] = self.read["welded_pos"] + actions[:, :3] * MAX_DISPLACEMENT
         self._target_quat[:] = self.read["welded_quat"] + actions[:, 3:] * MAX_DISPLACEMENT
         if self.on_table:
+            self._keep_on_surface()
             first = self.read["first_pose"]
             self._target_pos[:, 2] = first[:, 2]
             self._target_quat[:] = turned_about_vertical(self._target_quat, first[:, 3:])
@@ -89,7 +90,8 @@ class DerivedObjectVecEnv(BatchVecEnv):
         n_envs: number of copies, at least 1.
         n_threads: threads that step them; None takes one a processor.
         seed: of the draws of episodes; None is random.
-        on_table: whether the object keeps the height and tilt that it starts with.
+        on_table: whether the object keeps the height and tilt that it starts with, and keeps
+            off the edge of what it lies on.
 
     Raises:
         ValueError: a number below 1.

@@ -72,11 +72,12 @@ def kept_as(env_id: str) -> str:
     Raises:
         ValueError: its object cannot be followed.
     """
+    edge = "-edge" * (True in surface_choices(env_id))  # kept on its surface, and off its edge
     if env_id in IDS:
-        return physics_id(env_id)
+        return physics_id(env_id) + edge
     context = derived(env_id).context
     told = hashlib.sha256(" ".join(context).encode()).hexdigest()[:6]
-    return derived(env_id).kept_as + (f"-{told}" if context else "")
+    return derived(env_id).kept_as + (f"-{told}" if context else "") + edge
 
 
 def surface_choices(env_id: str, setting: bool | None = None) -> tuple[bool, ...]:

@@ -18,6 +18,7 @@ import pytest
 from cli_runs import TINY
 from short_films import record_an_episode
 
+from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.command import pictures
 from sb3_follow_object.command.cli import _print_table, main
 from sb3_follow_object.common import extras
@@ -304,7 +305,7 @@ def test_predictor_is_learned_once_and_then_taken_from_the_cache(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    folder = tmp_path / TASK / physics_id(TASK)
+    folder = tmp_path / TASK / kept_as(TASK)
     own = [text for text in TINY if text.split("=")[0].split(".")[0] in OF_OBJECT_STAGE]
     words = ["predictor", "--env", TASK, "--seed", 1, "--out", folder, "--set", *own]
     folder.mkdir(parents=True)

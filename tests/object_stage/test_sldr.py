@@ -15,6 +15,7 @@ from tiny import TASK, cache_networks, cache_predictor, tiny_networks
 from tiny_runs import bare_run
 from toy import HORIZON, PointEnv
 
+from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.callbacks.rollout import run_episodes
 from sb3_follow_object.common.array_trees import load_tree, save_tree
 from sb3_follow_object.common.files import LOCK, lock
@@ -26,7 +27,6 @@ from sb3_follow_object.envs import (
     ObjectVecEnv,
     make_vec,
     object_state,
-    physics_id,
 )
 from sb3_follow_object.object_stage.networks import ACTION, FILE, OBSERVATION, ObjectNetworks
 from sb3_follow_object.object_stage.sldr import SldrReward
@@ -389,7 +389,7 @@ def test_half_an_object_stage_is_refused_and_left_alone(
 ) -> None:
     monkeypatch.setattr(predictor_cache, "learn_predictor", lambda *_: pytest.fail("learned again"))
     keep(tmp_path)
-    folder = tmp_path / TASK / physics_id(TASK)
+    folder = tmp_path / TASK / kept_as(TASK)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(ValueError, match=f"{sentence}.*; give an empty folder"):
         get(TASK, folder, report=pytest.fail)
@@ -413,7 +413,7 @@ def test_half_an_object_stage_in_the_cache_is_learned_whole(
     monkeypatch.setattr(predictor_cache, "learn_predictor", learn)
     for _ in range(2):
         assert get_object_networks(TASK, report=pytest.fail).env_id == TASK
-    assert learned == [tmp_path / TASK / physics_id(TASK)]
+    assert learned == [tmp_path / TASK / kept_as(TASK)]
 
 
 def test_networks_name_their_task_without_a_module(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.envs import TASKS, physics_id
 from sb3_follow_object.imagination.goal_predictor import GoalPredictor
 from sb3_follow_object.object_stage.networks import FILE, ObjectNetworks
@@ -23,7 +24,7 @@ def cache_predictor(cache: Path) -> None:
     paths = start[:, None] + share * (goal - start)[:, None]
     facts = {"env_id": TASK, "physics": physics_id(TASK)}
     predictor = GoalPredictor.fit(paths, goal, hidden=(16,), epochs=3, **facts)
-    predictor.save(cache / TASK / facts["physics"])
+    predictor.save(cache / TASK / kept_as(TASK))
 
 
 def tiny_networks(env_id: str = TASK) -> ObjectNetworks:
@@ -33,6 +34,6 @@ def tiny_networks(env_id: str = TASK) -> ObjectNetworks:
 
 def cache_networks(cache: Path) -> None:
     """Keep object networks in a cache folder."""
-    folder = cache / TASK / physics_id(TASK)
+    folder = cache / TASK / kept_as(TASK)
     folder.mkdir(parents=True, exist_ok=True)
     tiny_networks().save(folder / FILE)
