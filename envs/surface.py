@@ -20,8 +20,8 @@ def no_edge() -> np.ndarray:
 def surface_bounds(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
     """Where a body's origin may be without any of the body beyond the edge of its surface.
 
-    Found are planes and boxes along the world's axes that stand still right below a body with a
-    free joint; of every other surface no edge is known.
+    Found are boxes along the world's axes that stand still right below a body with a free joint;
+    planes have no edge, and of every other surface none is known.
 
     Args:
         model: that holds body and surface.
@@ -71,13 +71,10 @@ def _face(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[np.nda
     turned = np.abs(data.geom_xmat[geom].reshape(3, 3))
     if np.abs(turned.max(axis=0) - 1.0).max() > _SQUARE:
         return None
-    centre, size = data.geom_xpos[geom], model.geom_size[geom]
+    centre, half = data.geom_xpos[geom], model.geom_size[geom]
     if model.geom_type[geom] == _GEOM.mjGEOM_PLANE and turned[2, 2] > 0.5:
-        half = np.where(size > 0.0, size, np.inf)
-        half[2] = 0.0
-    elif model.geom_type[geom] == _GEOM.mjGEOM_BOX:
-        half = size
-    else:
+        half = np.array([np.inf, np.inf, 0.0])  # its size is for pictures alone
+    elif model.geom_type[geom] != _GEOM.mjGEOM_BOX:
         return None
     half = half[turned.argmax(axis=1)]  # along the world's axes
     edges = np.stack([centre[:2] - half[:2], centre[:2] + half[:2]])

@@ -149,7 +149,7 @@ def object_scene_of(
     )
     _check_starts(scene, resets)
     around = success_distance + float(np.linalg.norm(offset))
-    return replace(scene, surface=_surface(scene, resets.goals[:, :2], around))
+    return replace(scene, surface=_surface(scene, resets.goals, around))
 
 
 def physics_digest_of(
@@ -253,7 +253,7 @@ def _standing(alone: mujoco.MjModel, copied: Transcription, resets: Resets) -> n
 
 
 def _surface(scene: DerivedScene, goals: np.ndarray, around: float) -> np.ndarray:
-    """Bounds of what the object lies on, unless episodes begin or have goals (n, 2) beyond them."""
+    """Bounds of what the object lies on, unless episodes begin or have goals (n, 3) beyond them."""
     data, starts = mujoco.MjData(scene.model), np.empty((len(goals), 2))
     for episode in reversed(range(len(goals))):  # the first one is looked at last
         data.qpos[:] = scene.qpos[episode]
@@ -261,7 +261,7 @@ def _surface(scene: DerivedScene, goals: np.ndarray, around: float) -> np.ndarra
         starts[episode] = data.xpos[scene.welded, :2]
     bounds = surface_bounds(scene.model, data, scene.welded)
     within = (bounds[0] <= starts) & (starts <= bounds[1])
-    reached = (bounds[0] - around <= goals) & (goals <= bounds[1] + around)
+    reached = (bounds[0] - around <= goals[:, :2]) & (goals[:, :2] <= bounds[1] + around)
     return bounds if within.all() and reached.all() else no_edge()
 
 

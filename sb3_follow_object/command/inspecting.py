@@ -56,7 +56,7 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
         "goal": _goal(found),
         "reached": f"within {found.success_distance * 1e3:.0f} mm" + _shifted(found),
         "varies": _varies(found),
-        "moves": "on its surface, unless it does not learn so" if found.on_surface else "freely",
+        "moves": _moves(found),
         "robot": _robot(found),
         "effector": _effector(found),
         "speed": _speed(found),
@@ -64,6 +64,18 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
         "steps a second": f"object {_object_speed(found):,.0f}, robot {_robot_speed(name):,.0f}",
         "physics": found.physics,
     }
+
+
+def _moves(found: Derived) -> str:
+    if not found.on_surface:
+        return "freely"
+    known = [
+        f"{axis} {low:.2f} to {high:.2f}"
+        for axis, low, high in zip("xy", *found.scene.surface, strict=True)
+        if np.isfinite([low, high]).all()
+    ]
+    edge = f" ({', '.join(known)} m)" if known else ""
+    return f"on its surface{edge}, unless it does not learn so"
 
 
 def _check_actions(env_id: str) -> None:

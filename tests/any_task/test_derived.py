@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from test_finding import Kitchen
 from sb3_follow_object.any_task import derived as module
 from sb3_follow_object.any_task.derived import Derived, derived
 from sb3_follow_object.any_task.resets import record_resets
+from sb3_follow_object.any_task.scene import _surface
 from sb3_follow_object.any_task.simulation import DerivedObjectVecEnv, turned_about_vertical
 from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.settings.presets import run_config
@@ -146,6 +148,34 @@ def test_an_object_on_a_surface_keeps_height_and_tilt() -> None:
     turn = turned_about_vertical(env.simulation._target_quat, first[:, 3:])
     np.testing.assert_allclose(turn, env.simulation._target_quat, atol=1e-12)
     env.close()
+
+
+def test_an_object_on_a_surface_is_kept_off_its_edge() -> None:
+    scene = derived("ArmAndWall-v0").scene
+    table = scene.model.geom("table")
+    env = alone(derived("ArmAndWall-v0"), 1, on_table=True)
+    env.reset()
+    for _ in range(40):
+        obs = env.step(-np.eye(7)[:1])[0]  # to the side where no wall stands
+    half = scene.model.geom_size[scene.model.body("box").geomadr[0]]
+    edge = table.pos[0] - table.size[0] + half[0]
+    assert scene.surface[0, 0] == pytest.approx(edge)
+    assert obs["achieved_goal"][0, 0] == pytest.approx(edge, abs=2e-3)
+    env.close()
+
+
+@pytest.mark.parametrize("where", ["goal", "start"])
+def test_a_surface_beyond_which_there_are_goals_or_starts_has_no_edge(where: str) -> None:
+    scene = derived("ArmAndWall-v0").scene
+    qpos, goals = scene.qpos.copy(), scene.goals.copy()
+    np.testing.assert_array_equal(_surface(scene, goals, 0.05), scene.surface)
+    joint = scene.model.jnt_qposadr[scene.model.body_jntadr[scene.welded]]
+    if where == "goal":
+        goals[3, 1] = scene.surface[1, 1] + 0.06
+    else:
+        qpos[3, joint + 1] = scene.surface[1, 1] + 0.01
+    moved = replace(scene, qpos=qpos)
+    assert np.isinf(_surface(moved, goals, 0.05)).all()
 
 
 def test_turns_about_the_vertical_are_all_that_is_left_of_a_turn() -> None:
