@@ -19,6 +19,7 @@ from ..ddpg.whole_episodes import WholeEpisodesDDPG
 from ..imagination.curriculum import Curriculum
 from ..imagination.goal_env import check_unstacked
 from ..imagination.vec_env import ImaginedGoalVecEnv, imagination_of
+from ..replay.episode_buffer import EpisodeReplayBuffer
 from ..replay.following import end_running_episodes, episodes_are_whole, follow_env
 from ..settings.stages import CurriculumTestSettings
 from .copyable import CopyableCallback
@@ -132,6 +133,7 @@ class CurriculumCallback(CopyableCallback):
     def _on_training_start(self) -> None:
         check_hears_rollouts(self)
         check_unstacked(self.training_env)
+        self._check_goes_on()
         self._follow_training_env()
         broken_off = self._is_training and self.model.num_timesteps > 0
         # Who knows what step the environment stands at after an exception? Ours do.
@@ -153,6 +155,16 @@ class CurriculumCallback(CopyableCallback):
         self._share_curriculum()
         if self.curriculum.state_dict() != before:  # running episodes show goals of other levels
             self._begin_new_episodes()
+
+    def _check_goes_on(self) -> None:
+        """Refuse a buffer that takes the goal that an episode goes on to for its last one's."""
+        buffer, curriculum = self._replay_buffer, imagination_of(self.training_env, _ASKER)[1]
+        if curriculum.go_on and not isinstance(buffer, EpisodeReplayBuffer | None):
+            raise ValueError(
+                "curriculum.go_on shows another goal within an episode, which "
+                f"{type(buffer).__name__} would store as the goal of the step before: take "
+                "FollowObjectReplayBuffer, or leave go_on out"
+            )
 
     def _follow_training_env(self) -> None:
         """Let the tests and the replay buffer have what training has, whatever was replaced."""

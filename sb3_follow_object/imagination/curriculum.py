@@ -35,12 +35,15 @@ class Curriculum:
         n_levels: number of levels with levels="path", >= 1; "time" does not read it.
         sampling: "uniform" (paper) or "max", always k = k_max (the paper's ablation).
         min_distance: metres, >= 0; imagined goals nearer to the start than this are not shown.
+        go_on: whether an episode of training that reaches its imagined goal shows the original one
+            from then on, so that what is left of it is spent on the way ahead. The paper's stays.
 
     Raises:
         ValueError: an argument is outside its range.
     """
 
     stride = 1  # of those pickled before there was one
+    go_on = False  # likewise
     first_k_max = 1
 
     def __init__(
@@ -57,6 +60,7 @@ class Curriculum:
         n_levels: int = CurriculumSettings.n_levels,
         sampling: str = CurriculumSettings.sampling,
         min_distance: float = CurriculumSettings.min_distance,
+        go_on: bool = CurriculumSettings.go_on,
     ) -> None:
         settings = CurriculumSettings(
             p=p,
@@ -69,6 +73,7 @@ class Curriculum:
             n_levels=n_levels,
             sampling=sampling,  # type: ignore[arg-type]
             min_distance=min_distance,
+            go_on=go_on,
         )
         self.horizon = checked_whole("horizon", horizon, 1)
         self.levels = settings.levels
@@ -79,6 +84,7 @@ class Curriculum:
         self.finish_threshold = settings.finish_threshold
         self.sampling = settings.sampling
         self.min_distance = settings.min_distance
+        self.go_on = settings.go_on
         self.k_max = self.first_k_max = checked_whole("k_max", settings.k_max, 1, self.n_levels)
         self._passed_last = False
         self._tests = SequentialTest() if settings.sequential else None

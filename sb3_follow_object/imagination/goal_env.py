@@ -20,6 +20,7 @@ from .goal_predictor import GoalPredictor
 Observation = dict[str, np.ndarray]
 
 LAST = "last_observation"  # in an info that ends an episode: its last observation, as it was
+GOES_ON = "goes_on"  # in an info: the next step is for another goal than this one was
 STREAM = 0x60A1  # parts the goals' random numbers from those of the environment's own seed
 
 

@@ -22,6 +22,7 @@ from ..envs import IDS
 from ..envs.robot_copies import ProcessVecEnv
 from .curriculum import Curriculum
 from .goal_env import (
+    GOES_ON,
     LAST,
     STREAM,
     Observation,
@@ -49,6 +50,9 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
     Observations, infos and the ends of episodes are those of ``ImaginedGoalWrapper``, and
     ``terminal_observation`` carries the shown goal too. Put VecMonitor outside, so that returns
     are those of the shown goals.
+
+    Where the curriculum lets episodes go on, the info of a step that reached its imagined goal has
+    ``goes_on``: the observation after it shows the original goal, which the next step is for.
 
     It imagines from its first reset, as ``ImaginedGoalWrapper`` does that is given a Curriculum.
 
@@ -167,6 +171,10 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
             last = infos[i]["terminal_observation"]
             last = {**last, "desired_goal": self._shown[i].copy()}
             infos[i] |= {"terminal_observation": last, LAST: last}
+        if self.curriculum.go_on and self.mode == "train":
+            for i in np.flatnonzero(success & (self._level > 0) & ~dones):
+                self._shown[i], self._level[i] = self._original[i], 0
+                infos[i][GOES_ON] = True
         if ended.size:
             self._draw(ended, obs)
         return self._relabel(obs), rewards, dones, infos

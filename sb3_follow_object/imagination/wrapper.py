@@ -27,6 +27,7 @@ from ..envs.goal_envs import has_method
 from ..envs.robot_copies import with_face
 from .curriculum import Curriculum
 from .goal_env import (
+    GOES_ON,
     LAST,
     STREAM,
     Observation,
@@ -52,7 +53,9 @@ class ImaginedGoalWrapper(
 
     Infos carry ``original_goal`` (3,) in metres, ``imagined_level`` (0 where the original goal is
     shown) and, after each step, ``is_success`` for the shown and ``original_success`` for the
-    original goal; ``context`` (c,), too, if F_phi sees the places of other things. When an episode
+    original goal; ``context`` (c,), too, if F_phi sees the places of other things; and ``goes_on``
+    where the curriculum lets the episode go on: the observation after that step shows the original
+    goal, which the next step is for. When an episode
     ends is left to the environment: one that terminates on its goal still does so on the original
     one.
 
@@ -158,8 +161,13 @@ class ImaginedGoalWrapper(
             "is_success": self._succeeds(achieved, self._shown),
             "original_success": self._succeeds(achieved, self._original),
         }
+        ended = terminated or truncated
+        may_go_on = self.curriculum.go_on and self.mode == "train" and self._level > 0
+        if may_go_on and info["is_success"] and not ended:
+            self._shown, self._level = self._original, 0
+            info[GOES_ON] = True
         obs = self._relabel(obs)
-        if terminated or truncated:
+        if ended:
             info[LAST] = obs
         return obs, paid, terminated, truncated, info
 

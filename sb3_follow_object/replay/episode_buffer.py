@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 
 from ..envs.goal_envs import episode_steps
 from ..envs.goal_space import GoalSpace, goal_space
-from ..imagination.goal_env import LAST
+from ..imagination.goal_env import GOES_ON, LAST
 from ..settings.sizes import check_buffer
 from .episode_table import EpisodeTable
 from .record_buffer import Gathered, RecordReplayBuffer
@@ -73,7 +73,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         """
         if self.n_added == 0:
             self.check_first()
-        next_obs = self._with_last_observations(next_obs, done, infos)
+        next_obs = _for_one_goal(obs, self._with_last_observations(next_obs, done, infos), infos)
         if any(EXECUTED in info for info in infos):
             action = self._executed(action, infos)
         pos = self.pos
@@ -101,7 +101,7 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
             self._forget_episode(row)
         running = self._current_ep_start != pos
         if running.any():
-            self.end_episodes(self._broken_off(running))
+            self.end_episodes(self._broken_off(running, infos))
         self.ep_start[pos] = self._current_ep_start
         if self.copy_info_dict:
             self.infos[pos] = infos
@@ -351,3 +351,15 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         """Share of the stored transitions that belong to episodes in which the object moved."""
         total = self.table.n_transitions()
         return self.table.n_transitions(with_priority=True) / total if total else 0.0
+
+
+def _for_one_goal(
+    obs: dict[str, np.ndarray], next_obs: dict[str, np.ndarray], infos: list[dict[str, Any]]
+) -> dict[str, np.ndarray]:
+    """Next observations with the goal of the step, where the next step is for another."""
+    rows = [row for row, info in enumerate(infos) if info.get(GOES_ON)]
+    if not rows:
+        return next_obs
+    goals = np.array(next_obs["desired_goal"])
+    goals[rows] = obs["desired_goal"][rows]
+    return {**next_obs, "desired_goal": goals}

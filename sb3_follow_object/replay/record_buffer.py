@@ -190,17 +190,24 @@ class RecordReplayBuffer(WholeCopies, HerReplayBuffer):
         }
         return named | {_SAID[name]: getattr(self, name)[pos] for name in ("actions", "rewards")}
 
-    def _broken_off(self, running: np.ndarray) -> np.ndarray:
+    def _broken_off(self, running: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """Environments (m,) whose step at `pos` does not begin where their last one ended.
+
+        Another goal than the last step's is no sign of it where it is the original one, to which an
+        episode may have gone on.
 
         Args:
             running: whose episode waits for more steps, (n_envs,) bool; no other is broken off.
+            infos: of the step, one dict an environment.
         """
         pos, broken = self.pos, np.zeros(0, dtype=bool)
         for key, store in self.observations.items():
             here, before = store[pos], self.next_observations[key][pos - 1]
             if not same_bytes(here, before):
                 differs = (here != before).reshape(self.n_envs, -1).any(axis=1) & running
+                if key == "desired_goal":
+                    for row in np.flatnonzero(differs):
+                        differs[row] = infos[row].get("imagined_level") != 0
                 broken = broken | differs if len(broken) else differs
         return broken.nonzero()[0]
 

@@ -49,6 +49,9 @@ class CurriculumSettings(Group):
         Number,
         setting("imagined goals nearer to the start are not shown", unit="metres", ge=0),
     ] = 0.0
+    go_on: Annotated[
+        Flag, setting("whether an episode that reaches its imagined goal goes on to the original")
+    ] = False
 
 
 @dataclass(frozen=True)

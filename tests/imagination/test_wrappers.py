@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import toy
 from gymnasium.utils.env_checker import check_env
-from imagined import N, check_transitions, episodes, imagining, play
+from imagined import N, check_transitions, episodes, expected_goal, imagining, play
 from stable_baselines3 import DDPG, SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -269,6 +269,37 @@ def test_the_gymnasium_wrapper_shows_goals_in_the_same_way() -> None:
     check_transitions(curriculum, finished)
     levels = {episode[0]["info"]["imagined_level"] for episode in finished}
     assert levels == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_an_episode_that_reaches_its_imagined_goal_goes_on_to_the_original(batched: bool) -> None:
+    curriculum = toy.curriculum(k_max=3, p=0.3, go_on=True)
+    venv: VecEnv = (
+        imagining(curriculum) if batched else DummyVecEnv([lambda: single(curriculum)] * N)
+    )
+    went_on, judge = 0, toy.PointEnv()
+    for episode in episodes(venv, 300):
+        shown = expected_goal(curriculum, episode[0])
+        level = episode[0]["info"]["imagined_level"]
+        for step in episode:
+            info, achieved = step["info"], step["next_obs"]["achieved_goal"]
+            np.testing.assert_allclose(step["obs"]["desired_goal"], shown, atol=1e-6)
+            assert info["imagined_level"] == level
+            assert info["is_success"] == bool(judge.is_success(achieved, shown))
+            assert step["reward"] == float(judge.compute_reward(achieved, shown, {}))
+            goes_on = level > 0 and info["is_success"] and not step["done"]
+            assert info.get("goes_on", False) == goes_on
+            if goes_on:
+                went_on, level, shown = went_on + 1, 0, info["original_goal"]
+            np.testing.assert_allclose(step["next_obs"]["desired_goal"], shown, atol=1e-6)
+    assert went_on > 10
+
+
+def test_tests_of_h_max_do_not_go_on() -> None:
+    curriculum = toy.curriculum(k_max=2, go_on=True)
+    finished = episodes(imagining(curriculum, "test"), 200)
+    check_transitions(curriculum, finished)
+    assert any(step["info"]["is_success"] for episode in finished for step in episode[:-1])
 
 
 def test_the_gymnasium_wrapper_is_a_valid_environment() -> None:

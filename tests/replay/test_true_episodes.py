@@ -11,11 +11,12 @@ from numbered import ALGORITHMS, NumberedEnv, assert_true_episodes, learner, num
 from small_buffers import as_arrays, fill, make_buffer, make_env
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv
-from toy import HORIZON, StraightPredictor, curriculum
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from toy import HORIZON, PointEnv, StraightPredictor, curriculum
 
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
+from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
 
 
 class StopAfter(BaseCallback):
@@ -208,3 +209,40 @@ def test_the_curriculum_callback_lets_stock_algorithms_begin_anew(name: str) -> 
                 continue
     model.learn(100, callback=callback, reset_num_timesteps=False)
     assert_true_episodes(model.replay_buffer)
+
+
+@pytest.mark.parametrize("face", ["batched", "single"])
+@pytest.mark.parametrize("algorithm", ["HerDDPG", "DDPG"])
+def test_an_episode_that_goes_on_to_another_goal_stays_one(algorithm: str, face: str) -> None:
+    levels = curriculum(k_max=3, p=0.2, go_on=True)
+    env: VecEnv
+    if face == "batched":
+        env = ImaginedGoalVecEnv(DummyVecEnv([PointEnv] * 3), StraightPredictor(), levels)
+    else:
+        env = DummyVecEnv(
+            [lambda: ImaginedGoalWrapper(PointEnv(), StraightPredictor(), levels)] * 3
+        )
+    model = learner(algorithm, env, train_freq=HORIZON)
+    model.learn(40 * 3 * HORIZON)
+    buffer = model.replay_buffer
+    length = buffer.table.length[buffer.table.length > 0]
+    assert len(length) == 40 * 3 and (length == HORIZON).all()
+    goals = buffer.observations["desired_goal"][: buffer.pos]
+    # Each transition is about the goal that its step was for, before and after it ...
+    np.testing.assert_array_equal(goals, buffer.next_observations["desired_goal"][: buffer.pos])
+    achieved = buffer.next_observations["achieved_goal"][: buffer.pos]
+    np.testing.assert_array_equal(
+        buffer.rewards[: buffer.pos], PointEnv().compute_reward(achieved, goals, {})
+    )
+    # ... and some episodes have two.
+    goals = goals.reshape(40, HORIZON, 3, 3)
+    changes = (goals[:, 1:] != goals[:, :-1]).any(axis=-1).sum(axis=1)
+    assert set(np.unique(changes)) == {0, 1}
+
+
+def test_what_would_store_the_next_goal_for_the_last_is_refused() -> None:
+    levels = curriculum(go_on=True)
+    env = ImaginedGoalVecEnv(DummyVecEnv([PointEnv]), StraightPredictor(), levels)
+    model = learner("DDPG", env, replay_buffer_class=HerReplayBuffer)
+    with pytest.raises(ValueError, match=r"go_on shows another goal .* HerReplayBuffer would"):
+        model.learn(100, callback=CurriculumCallback())
