@@ -254,12 +254,14 @@ def _standing(alone: mujoco.MjModel, copied: Transcription, resets: Resets) -> n
 
 def _surface(scene: DerivedScene, goals: np.ndarray, around: float) -> np.ndarray:
     """Bounds of what the object lies on, unless episodes begin or have goals (n, 3) beyond them."""
-    data, starts = mujoco.MjData(scene.model), np.empty((len(goals), 2))
-    for episode in reversed(range(len(goals))):  # the first one is looked at last
-        data.qpos[:] = scene.qpos[episode]
-        mujoco.mj_kinematics(scene.model, data)
-        starts[episode] = data.xpos[scene.welded, :2]
-    bounds = surface_bounds(scene.model, data, scene.welded)
+    model, data = scene.model, mujoco.MjData(scene.model)
+    data.qpos[:] = scene.qpos[0]
+    mujoco.mj_kinematics(model, data)
+    bounds = surface_bounds(model, data, scene.welded)
+    if np.isinf(bounds).all():
+        return bounds
+    joint = int(model.jnt_qposadr[model.body_jntadr[scene.welded]])  # a free one, as it has bounds
+    starts = scene.qpos[:, joint : joint + 2]
     within = (bounds[0] <= starts) & (starts <= bounds[1])
     reached = (bounds[0] - around <= goals[:, :2]) & (goals[:, :2] <= bounds[1] + around)
     return bounds if within.all() and reached.all() else no_edge()

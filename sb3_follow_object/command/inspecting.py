@@ -69,12 +69,8 @@ def inspect(env_id: str, report: Report) -> dict[str, str]:
 def _moves(found: Derived) -> str:
     if not found.on_surface:
         return "freely"
-    known = [
-        f"{axis} {low:.2f} to {high:.2f}"
-        for axis, low, high in zip("xy", *found.scene.surface, strict=True)
-        if np.isfinite([low, high]).all()
-    ]
-    edge = f" ({', '.join(known)} m)" if known else ""
+    (x, y), (to_x, to_y) = found.scene.surface
+    edge = f" (x {x:.2f} to {to_x:.2f}, y {y:.2f} to {to_y:.2f} m)" if np.isfinite(x) else ""
     return f"on its surface{edge}, unless it does not learn so"
 
 
