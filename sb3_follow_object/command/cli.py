@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..common.reports import Trouble, reason
+from ..common.reports import Report, Trouble, reason
 from ..settings.methods import check_methods
 from . import demo, export, picture, report
 from .arguments import (
@@ -170,7 +170,7 @@ def _config(args: argparse.Namespace) -> RunConfig:
         file=args.config,
         seed=args.seed or 0,
         overrides=overrides_of(args),
-        report=(lambda sentence: None) if getattr(args, "quiet", False) else _warn,
+        report=_warn_once(args),
     )
     for text in args.set:
         if why := unread(text.split("=")[0], config):
@@ -255,6 +255,18 @@ def _warn(sentence: str) -> None:
     print(f"{PROGRAM}: {sentence}", file=sys.stderr)
 
 
+def _warn_once(args: argparse.Namespace) -> Report:
+    """Return what prints each sentence once, or with `--quiet` none."""
+    said: set[str] = set()
+
+    def say(sentence: str) -> None:
+        if sentence not in said:
+            said.add(sentence)
+            _warn(sentence)
+
+    return (lambda sentence: None) if getattr(args, "quiet", False) else say
+
+
 def _watch(args: argparse.Namespace) -> None:
     from ..settings.presets import load_config
     from .pictures import record
@@ -302,7 +314,8 @@ def _compare(args: argparse.Namespace) -> None:
     check_agreed("threads", args.threads, overrides)
     settings = Settings(args.steps, args.preset, overrides, args.paper_evaluation)
     grid = (args.out, args.tasks, args.methods, args.seeds, settings)
-    wanted = plan(*grid)  # what is invalid is refused before a cluster is asked for
+    # What is invalid is refused before a cluster is asked for.
+    wanted = plan(*grid, report=_warn_once(args))
     left = runs_left(args.out, wanted, args.retry_failed)
     executor: Executor
     if args.ray is None:

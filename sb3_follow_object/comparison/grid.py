@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from ..common.reports import Report
 from ..common.suggestions import did_you_mean
 from ..envs import IDS, TASKS
 from ..envs.goal_envs import check_task
@@ -42,6 +43,7 @@ def plan(
     seeds: Sequence[int],
     settings: Settings,
     threads: int = 1,
+    report: Report = lambda sentence: None,
 ) -> list[Cell]:
     """Return the runs of a grid, a seed's before the next one's, without touching the folder.
 
@@ -52,6 +54,7 @@ def plan(
         seeds: >= 0.
         settings: of all runs.
         threads: of each run's simulation and of its PyTorch, where the settings do not say.
+        report: called with a sentence where looking at a task of others may take minutes.
 
     Raises:
         ValueError: an unknown name, settings that contradict each other, two tasks whose runs would
@@ -68,7 +71,7 @@ def plan(
         ids.setdefault(task_label(env_id), env_id)
     _check_apart(ids, methods)
     of_some = _without_networks(settings, methods)
-    read = {(e, m): _read_by(e, m, of_some) for e in ids.values() for m in methods}
+    read = {(e, m): _read_by(e, m, of_some, report) for e in ids.values() for m in methods}
     for name in settings.overrides or {}:
         if not any(name in (its.overrides or {}) for its in read.values()):
             raise ValueError(f"--set {name} does nothing: none of {', '.join(methods)} reads it")
@@ -122,11 +125,11 @@ def _without_networks(settings: Settings, methods: Sequence[str]) -> Settings:
     return replace(settings, overrides=kept)
 
 
-def _read_by(env_id: str, method: str, settings: Settings) -> Settings:
+def _read_by(env_id: str, method: str, settings: Settings, report: Report) -> Settings:
     """Return the settings without the overrides that a method does not read."""
     given = settings.overrides or {}
     plain = {name: given[name] for name in given if name.rpartition(".")[0] not in _MARKS}
-    config = _config(env_id, method, 0, replace(settings, overrides=plain), 1)
+    config = _config(env_id, method, 0, replace(settings, overrides=plain), 1, report)
     own = {name: given[name] for name in given if name in plain or _has(config, name)}
     if len(own) > len(plain):
         config = _config(env_id, method, 0, replace(settings, overrides=own), 1)
@@ -165,13 +168,27 @@ def _env_id(task: str) -> str:
     return task
 
 
-def _config(env_id: str, method: str, seed: int, settings: Settings, threads: int) -> RunConfig:
+def _config(
+    env_id: str,
+    method: str,
+    seed: int,
+    settings: Settings,
+    threads: int,
+    report: Report = lambda sentence: None,
+) -> RunConfig:
     overrides: dict[str, Any] = {"n_threads": threads, "torch_threads": threads, **_TO_THE_END}
     if settings.steps is not None:
         overrides["n_timesteps"] = settings.steps
     overrides |= _paper_rhythm(env_id, settings)
     overrides |= settings.overrides or {}
-    return run_config(env_id, method=method, preset=settings.preset, seed=seed, overrides=overrides)
+    return run_config(
+        env_id,
+        method=method,
+        preset=settings.preset,
+        seed=seed,
+        overrides=overrides,
+        report=report,
+    )
 
 
 def _paper_rhythm(env_id: str, settings: Settings) -> dict[str, int]:

@@ -20,6 +20,8 @@ from sb3_follow_object.any_task import derived as looking
 from sb3_follow_object.any_task import registering
 from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.common.cache import CACHE_VARIABLE
+from sb3_follow_object.comparison.cells import Settings
+from sb3_follow_object.comparison.grid import plan
 from sb3_follow_object.envs import robot_copies
 from sb3_follow_object.follow_object.follow_object import FollowObject
 from sb3_follow_object.follow_object.saved_folder import read
@@ -333,6 +335,12 @@ def test_settings_and_predictors_say_that_resets_are_recorded(
     with pytest.raises(ValueError, match=FACTS_FILE):
         predictor_cache.get_predictor(moving_wall.WALL, report=said.append)
     assert said == [f"where 60 episodes of {moving_wall.WALL} begin is recorded, once"]
+
+
+def test_a_comparison_says_as_it_plans_that_resets_are_recorded(tmp_path: Path) -> None:
+    said: list[str] = []
+    plan(tmp_path, [ARM], ["her", "fo"], [0, 1], Settings(steps=1000), report=said.append)
+    assert said == [f"where 60 episodes of {ARM} begin is recorded, once"]
 
 
 def test_a_refused_curriculum_leaves_no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
