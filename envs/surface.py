@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from .physics_engine import mujoco
 from .robot_parts import touching_geoms
 
 _NEAR = 0.01  # metres between an object and the surface that it lies on
+_GAP = 1e-3  # metres between faces that a body does not go over
 _SQUARE = 1e-3  # how far off the world's axes a box may be turned
 _GEOM = mujoco.mjtGeom
 
@@ -18,10 +21,12 @@ def no_edge() -> np.ndarray:
 
 
 def surface_bounds(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
-    """Where a body's origin may be without any of the body beyond the edge of its surface.
+    """Where a body's origin may be while the body lies on its surface, however it is turned.
 
-    Found are boxes along the world's axes that stand still right below a body with a free joint;
-    planes have no edge, and of every other surface none is known.
+    The origin keeps as far from the edge as the body is narrow: what is long may hang over, what
+    weighs down does not. Found are boxes along the world's axes that stand still right below a body
+    with a free joint; planes have no edge, and of every other surface none is known, nor of one
+    that goes on in another as high.
 
     Args:
         model: that holds body and surface.
@@ -39,28 +44,44 @@ def surface_bounds(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.
     of_body = model.body_rootid[model.geom_bodyid[touching]] == body
     if not of_body.any():
         return unknown
-    extents = [_extent(model, data, geom) for geom in touching[of_body]]
-    low = np.min([extent[0] for extent in extents], axis=0)
-    high = np.max([extent[1] for extent in extents], axis=0)
-    origin, highest, bounds = data.xpos[body], -np.inf, unknown
-    for geom in touching[~of_body]:
-        face = _face(model, data, geom)
-        if face is None:
-            continue
-        edges, height = face
+    corners = np.concatenate([_corners(model, data, geom) for geom in touching[of_body]])
+    origin, lowest = data.xpos[body], corners[:, 2].min()
+    faces = [face for geom in touching[~of_body] if (face := _face(model, data, geom)) is not None]
+    near = [edges for edges, height in faces if abs(lowest - height) < _NEAR]
+    for edges in near:
         below = ((edges[0] <= origin[:2]) & (origin[:2] <= edges[1])).all()
-        if below and abs(low[2] - height) < _NEAR and height > highest:
-            highest = height
-            bounds = np.stack([edges[0] + (origin - low)[:2], edges[1] - (high - origin)[:2]])
-    return bounds if (bounds[0] <= bounds[1]).all() else unknown
+        if below and all(_holds(edges, other) or _apart(edges, other) for other in near):
+            narrow = _narrowest(corners[:, :2] - origin[:2])
+            bounds = edges + np.array([[narrow], [-narrow]])
+            return bounds if (bounds[0] <= bounds[1]).all() else unknown
+    return unknown
 
 
-def _extent(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner (3,) of the box along the world's axes around a geom."""
-    turned = data.geom_xmat[geom].reshape(3, 3)
-    centre = data.geom_xpos[geom] + turned @ model.geom_aabb[geom, :3]
-    half = np.abs(turned) @ model.geom_aabb[geom, 3:]
-    return centre - half, centre + half
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """Corners (8, 3) of the box along a geom's own axes that is around it."""
+    centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    corners = centre + half * np.array(list(product((-1.0, 1.0), repeat=3)))
+    placed: np.ndarray = data.geom_xpos[geom] + corners @ data.geom_xmat[geom].reshape(3, 3).T
+    return placed
+
+
+def _narrowest(points: np.ndarray) -> float:
+    """How far points (n, 2) reach beside 0 in the direction in which they reach least far."""
+    sides = (points[:, None] - points).reshape(-1, 2)
+    length = np.linalg.norm(sides, axis=1)
+    ahead = sides[length > 0.0] / length[length > 0.0, None]
+    across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)  # among them the hull's normals
+    return max(0.0, float((across @ points.T).max(axis=1).min()))
+
+
+def _holds(edges: np.ndarray, other: np.ndarray) -> bool:
+    """Whether a face (2, 2) is all of another, or more."""
+    return bool((edges[0] <= other[0]).all() and (other[1] <= edges[1]).all())
+
+
+def _apart(edges: np.ndarray, other: np.ndarray) -> bool:
+    """Whether there is a gap between two faces (2, 2)."""
+    return bool((edges[1] + _GAP < other[0]).any() or (other[1] + _GAP < edges[0]).any())
 
 
 def _face(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[np.ndarray, float] | None:

@@ -33,7 +33,7 @@ def check_standing(seen: Observed) -> None:
         if not np.array_equal(now, later):
             raise ValueError(
                 f"the goal moves within an episode, from {now.tolist()} to {later.tolist()}; an "
-                "imagined goal belongs to a whole episode"
+                "imagined goal is made for that of the first step"
             )
     moved = np.abs(seen.later[steps + 1] - seen.later[steps]).max(axis=(0, 2), initial=0.0)
     stands = standing(model) & ~robot_bodies(model)

@@ -148,8 +148,7 @@ def object_scene_of(
         context,
     )
     _check_starts(scene, resets)
-    around = success_distance + float(np.linalg.norm(offset))
-    return replace(scene, surface=_surface(scene, resets.goals, around))
+    return replace(scene, surface=_surface(scene, resets.goals))
 
 
 def physics_digest_of(
@@ -252,7 +251,7 @@ def _standing(alone: mujoco.MjModel, copied: Transcription, resets: Resets) -> n
     return places
 
 
-def _surface(scene: DerivedScene, goals: np.ndarray, around: float) -> np.ndarray:
+def _surface(scene: DerivedScene, goals: np.ndarray) -> np.ndarray:
     """Bounds of what the object lies on, unless episodes begin or have goals (n, 3) beyond them."""
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[:] = scene.qpos[0]
@@ -262,9 +261,15 @@ def _surface(scene: DerivedScene, goals: np.ndarray, around: float) -> np.ndarra
         return bounds
     joint = int(model.jnt_qposadr[model.body_jntadr[scene.welded]])  # a free one, as it has bounds
     starts = scene.qpos[:, joint : joint + 2]
-    within = (bounds[0] <= starts) & (starts <= bounds[1])
-    reached = (bounds[0] - around <= goals[:, :2]) & (goals[:, :2] <= bounds[1] + around)
+    point = data.site_xpos[int(model.site(POINT).id)] - data.xpos[scene.welded]
+    near = scene.success_distance + np.linalg.norm(point[:2])  # it may turn about the vertical
+    within, reached = (_beyond(bounds, starts) == 0.0), (_beyond(bounds, goals[:, :2]) <= near)
     return bounds if within.all() and reached.all() else no_edge()
+
+
+def _beyond(bounds: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """How far outside of bounds (2, 2) places (n, 2) lie, (n,) metres."""
+    return np.linalg.norm(places - np.clip(places, bounds[0], bounds[1]), axis=1)
 
 
 def _check_starts(scene: DerivedScene, resets: Resets) -> None:

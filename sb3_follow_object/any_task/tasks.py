@@ -6,6 +6,7 @@ import hashlib
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..envs import IDS, make_vec, object_id, physics_id
@@ -72,12 +73,13 @@ def kept_as(env_id: str) -> str:
     Raises:
         ValueError: its object cannot be followed.
     """
-    edge = "-edge" * (True in surface_choices(env_id))  # kept on its surface, and off its edge
+    on_surface = True in surface_choices(env_id)
     if env_id in IDS:
-        return physics_id(env_id) + edge
-    context = derived(env_id).context
-    told = hashlib.sha256(" ".join(context).encode()).hexdigest()[:6]
-    return derived(env_id).kept_as + (f"-{told}" if context else "") + edge
+        return physics_id(env_id) + "-edge" * on_surface  # of tables, off whose edge it is kept
+    task = derived(env_id)
+    told = hashlib.sha256(" ".join(task.context).encode()).hexdigest()[:6]
+    edge = "-edge" * (on_surface and bool(np.isfinite(task.scene.surface).any()))
+    return task.kept_as + (f"-{told}" if task.context else "") + edge
 
 
 def surface_choices(env_id: str, setting: bool | None = None) -> tuple[bool, ...]:

@@ -159,11 +159,11 @@ class CurriculumCallback(CopyableCallback):
     def _check_goes_on(self) -> None:
         """Refuse a buffer that takes the goal that an episode goes on to for its last one's."""
         buffer, curriculum = self._replay_buffer, imagination_of(self.training_env, _ASKER)[1]
-        if curriculum.go_on and not isinstance(buffer, EpisodeReplayBuffer | None):
+        if curriculum.go_on and not isinstance(buffer, EpisodeReplayBuffer):
+            theirs = "the model" if buffer is None else type(buffer).__name__
             raise ValueError(
-                "curriculum.go_on shows another goal within an episode, which "
-                f"{type(buffer).__name__} would store as the goal of the step before: take "
-                "FollowObjectReplayBuffer, or leave go_on out"
+                f"curriculum.go_on shows another goal within an episode, which {theirs} would take "
+                "for the goal of the step before: take FollowObjectReplayBuffer, or leave go_on out"
             )
 
     def _follow_training_env(self) -> None:

@@ -24,7 +24,7 @@ class Folding(nn.Module):
     """Mirrors states whose goal lies on the lower side of a plane, and the actions in them.
 
     What a network learns on one side it then can do on the other. The side is the goal's, which
-    stays where it is for an episode.
+    stays where it is but for an episode that goes on from an imagined goal to the original one.
 
     Args:
         mirrors: one for each plane, on different axes.

@@ -135,7 +135,7 @@ def with_terminal_observations(
 
 
 def check_goal_stays(given: np.ndarray, original: np.ndarray) -> None:
-    """Refuse an environment whose goal moves: an imagined goal belongs to a whole episode.
+    """Refuse an environment whose goal moves: imagined ones are made for that of its first step.
 
     Args:
         given: the environment's goals after a step, (..., 3) metres.

@@ -172,7 +172,7 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
             last = {**last, "desired_goal": self._shown[i].copy()}
             infos[i] |= {"terminal_observation": last, LAST: last}
         if self.curriculum.go_on and self.mode == "train":
-            for i in np.flatnonzero(success & (self._level > 0) & ~dones):
+            for i in np.flatnonzero(success & (self._level > 0) & (np.asarray(dones) == 0)):
                 self._shown[i], self._level[i] = self._original[i], 0
                 infos[i][GOES_ON] = True
         if ended.size:

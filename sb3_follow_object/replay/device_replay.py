@@ -182,7 +182,7 @@ class DeviceReplay(WholeCopies):
         buffer.check_ready()
         if not buffer.goals_are_shared:
             raise ValueError(
-                "replay on the device needs goals that stay the same within an episode; "
+                "replay on the device needs goals that are the same before and after a step; "
                 "set replay_on_device to False"
             )
         assert buffer.achieved is not None

@@ -73,7 +73,9 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
         """
         if self.n_added == 0:
             self.check_first()
-        next_obs = _for_one_goal(obs, self._with_last_observations(next_obs, done, infos), infos)
+        next_obs = self._with_last_observations(next_obs, done, infos)
+        ahead = next_obs["desired_goal"]
+        next_obs = _for_one_goal(obs, next_obs, infos)
         if any(EXECUTED in info for info in infos):
             action = self._executed(action, infos)
         pos = self.pos
@@ -101,7 +103,10 @@ class EpisodeReplayBuffer(RecordReplayBuffer):
             self._forget_episode(row)
         running = self._current_ep_start != pos
         if running.any():
-            self.end_episodes(self._broken_off(running, infos))
+            self.end_episodes(self._broken_off(running))
+        goes_on = next_obs["desired_goal"] is not ahead
+        dtype = self.observations["desired_goal"].dtype
+        self._goals_ahead = np.array(ahead, dtype) if goes_on else None
         self.ep_start[pos] = self._current_ep_start
         if self.copy_info_dict:
             self.infos[pos] = infos

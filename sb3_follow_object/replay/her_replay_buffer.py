@@ -258,6 +258,7 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
             "pos": self.pos,
             "full": self.full,
             "current_episode_start": self._current_ep_start,
+            **({} if self._goals_ahead is None else {"goals_ahead": self._goals_ahead}),
             "slots": {name: store[:used] for name, store in self._stores().items()},
             "table": self.table.state_dict(),
             "rng": self.rng.bit_generator.state,
@@ -282,6 +283,8 @@ class FollowObjectReplayBuffer(EpisodeReplayBuffer):
         self.pos, self.full = state["pos"], state["full"]
         self.revision += 1
         self._current_ep_start = state["current_episode_start"].copy()
+        ahead = state.get("goals_ahead")
+        self._goals_ahead = None if ahead is None else ahead.copy()
         self.table.load_state_dict(state["table"])
         self.rng.bit_generator.state = state["rng"]
         if self.selection is not None:

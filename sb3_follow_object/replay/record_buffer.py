@@ -66,6 +66,9 @@ class RecordReplayBuffer(WholeCopies, HerReplayBuffer):
     The arguments are HerReplayBuffer's.
     """
 
+    # Goals of the step to come (n_envs, d), where an episode goes on to another than is stored.
+    _goals_ahead: np.ndarray | None = None
+
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         fields: dict[str, tuple[int, ...]] = {}
@@ -126,6 +129,7 @@ class RecordReplayBuffer(WholeCopies, HerReplayBuffer):
         for at in np.ndindex(self.infos[:used].shape):
             self.infos[at] = {}
         self._current_ep_start[:] = 0
+        self._goals_ahead = None
         super().reset()
 
     def _can_share_goals(self) -> bool:
@@ -190,24 +194,19 @@ class RecordReplayBuffer(WholeCopies, HerReplayBuffer):
         }
         return named | {_SAID[name]: getattr(self, name)[pos] for name in ("actions", "rewards")}
 
-    def _broken_off(self, running: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
+    def _broken_off(self, running: np.ndarray) -> np.ndarray:
         """Environments (m,) whose step at `pos` does not begin where their last one ended.
-
-        Another goal than the last step's is no sign of it where it is the original one, to which an
-        episode may have gone on.
 
         Args:
             running: whose episode waits for more steps, (n_envs,) bool; no other is broken off.
-            infos: of the step, one dict an environment.
         """
         pos, broken = self.pos, np.zeros(0, dtype=bool)
         for key, store in self.observations.items():
             here, before = store[pos], self.next_observations[key][pos - 1]
+            if key == "desired_goal" and self._goals_ahead is not None:
+                before = self._goals_ahead
             if not same_bytes(here, before):
                 differs = (here != before).reshape(self.n_envs, -1).any(axis=1) & running
-                if key == "desired_goal":
-                    for row in np.flatnonzero(differs):
-                        differs[row] = infos[row].get("imagined_level") != 0
                 broken = broken | differs if len(broken) else differs
         return broken.nonzero()[0]
 

@@ -15,11 +15,13 @@ import pytest
 from test_finding import Kitchen
 
 from sb3_follow_object.any_task import derived as module
+from sb3_follow_object.any_task import tasks
 from sb3_follow_object.any_task.derived import Derived, derived
 from sb3_follow_object.any_task.resets import record_resets
-from sb3_follow_object.any_task.scene import _surface
+from sb3_follow_object.any_task.scene import POINT, _surface
 from sb3_follow_object.any_task.simulation import DerivedObjectVecEnv, turned_about_vertical
 from sb3_follow_object.any_task.tasks import kept_as
+from sb3_follow_object.envs.surface import no_edge
 from sb3_follow_object.settings.presets import run_config
 
 pytestmark = pytest.mark.usefixtures("few_resets")
@@ -164,18 +166,47 @@ def test_an_object_on_a_surface_is_kept_off_its_edge() -> None:
     env.close()
 
 
-@pytest.mark.parametrize("where", ["goal", "start"])
-def test_a_surface_beyond_which_there_are_goals_or_starts_has_no_edge(where: str) -> None:
+def test_a_surface_beyond_which_episodes_begin_has_no_edge() -> None:
     scene = derived("ArmAndWall-v0").scene
-    qpos, goals = scene.qpos.copy(), scene.goals.copy()
-    np.testing.assert_array_equal(_surface(scene, goals, 0.05), scene.surface)
+    qpos = scene.qpos.copy()
     joint = scene.model.jnt_qposadr[scene.model.body_jntadr[scene.welded]]
-    if where == "goal":
-        goals[3, 1] = scene.surface[1, 1] + 0.06
-    else:
-        qpos[3, joint + 1] = scene.surface[1, 1] + 0.01
-    moved = replace(scene, qpos=qpos)
-    assert np.isinf(_surface(moved, goals, 0.05)).all()
+    qpos[3, joint + 1] = scene.surface[1, 1] + 0.01
+    assert np.isinf(_surface(replace(scene, qpos=qpos), scene.goals)).all()
+
+
+@pytest.mark.parametrize(
+    ("beyond", "kept"),
+    [((0.04, 0.0), True), ((0.06, 0.0), False), ((0.03, 0.03), True), ((0.045, 0.045), False)],
+)
+def test_goals_out_of_reach_from_a_surface_take_its_edge_away(
+    beyond: tuple[float, float], kept: bool
+) -> None:
+    scene = derived("ArmAndWall-v0").scene  # a goal is reached within 5 cm
+    goals = scene.goals.copy()
+    goals[3, :2] = scene.surface[1] + beyond
+    assert np.isfinite(_surface(scene, goals)).all() == kept
+
+
+def test_what_is_kept_of_a_task_without_an_edge_is_not_called_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = derived("ArmAndWall-v0")
+    assert kept_as("ArmAndWall-v0") == f"{found.kept_as}-edge"
+    endless = replace(found, scene=replace(found.scene, surface=no_edge()))
+    monkeypatch.setattr(tasks, "derived", lambda env_id: endless)
+    assert kept_as("ArmAndWall-v0") == found.kept_as
+
+
+@pytest.mark.parametrize(("offset", "kept"), [((0.0, 0.0, 0.15), False), ((0.0, 0.15, 0.0), True)])
+def test_a_point_beside_the_objects_origin_reaches_further_and_one_above_it_does_not(
+    offset: tuple[float, ...], kept: bool
+) -> None:
+    scene = derived("ArmAndWall-v0").scene
+    model, goals = copy.copy(scene.model), scene.goals.copy()
+    point = model.site(POINT).id
+    model.site_pos[point], model.site_sameframe[point] = offset, 0
+    goals[3, 0] = scene.surface[1, 0] + 0.18
+    assert np.isfinite(_surface(replace(scene, model=model), goals)).all() == kept
 
 
 def test_turns_about_the_vertical_are_all_that_is_left_of_a_turn() -> None:

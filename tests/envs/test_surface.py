@@ -26,22 +26,61 @@ def bounds_of(scene: str, thing: str = CUBE, joint: str = FREE, pos: str = "0.1 
 @pytest.mark.parametrize(
     ("scene", "expected"),
     [
-        ('<geom type="box" size="0.5 0.4 0.05" pos="0 0 0.05"/>', [[-0.48, -0.37], [0.48, 0.37]]),
+        ('<geom type="box" size="0.5 0.4 0.05" pos="0 0 0.05"/>', [[-0.48, -0.38], [0.48, 0.38]]),
         # lying on its side: its height is along y
         (
             '<geom type="box" size="0.5 0.05 0.4" euler="90 0 0" pos="0 0 0.05"/>',
-            [[-0.48, -0.37], [0.48, 0.37]],
+            [[-0.48, -0.38], [0.48, 0.38]],
+        ),
+        # a mat on it has no edge of its own
+        (
+            '<geom type="box" size="0.2 0.3 0.002" pos="0.1 0.1 0.1"/>'
+            '<geom type="box" size="0.5 0.4 0.05" pos="0 0 0.05"/>',
+            [[-0.48, -0.38], [0.48, 0.38]],
+        ),
+        # a table beside it, as high
+        (
+            '<geom type="box" size="0.5 0.4 0.05" pos="0 0 0.05"/>'
+            '<geom type="box" size="0.5 0.4 0.05" pos="1.1 0 0.05"/>',
+            [[-0.48, -0.38], [0.48, 0.38]],
         ),
         # the table, not the floor and not what stands below it
         (
             '<geom type="plane" size="0 0 1"/><geom type="box" size="0.5 0.4 0.05" pos="0 0 0.05"/>'
             '<geom type="box" size="0.2 0.3 0.02" pos="0 0 0.02"/>',
-            [[-0.48, -0.37], [0.48, 0.37]],
+            [[-0.48, -0.38], [0.48, 0.38]],
         ),
     ],
 )
-def test_all_of_a_thing_stays_on_its_surface(scene: str, expected: list) -> None:
+def test_a_thing_stays_on_its_surface_by_as_much_as_it_is_narrow(
+    scene: str, expected: list
+) -> None:
     assert bounds_of(scene) == expected
+
+
+TABLE = '<geom type="box" size="0.5 0.4 0.05" pos="0 0 0.05"/>'
+
+
+@pytest.mark.parametrize("turn", [0, 20, 45, 90])
+@pytest.mark.parametrize(
+    ("thing", "narrow"),
+    [
+        ('<geom type="box" size="0.15 0.01 0.04" euler="0 0 {}"/>', 0.01),
+        ('<geom type="cylinder" size="0.1 0.04" euler="0 0 {}"/>', 0.1),
+        # a hammer, whose origin lies where its head is
+        (
+            '<geom type="box" size="0.03 0.02 0.04" euler="0 0 {0}"/>'
+            '<geom type="box" size="0.2 0.005 0.04" euler="0 0 {0}"/>',
+            0.02,
+        ),
+    ],
+)
+def test_how_a_thing_is_turned_does_not_move_its_bounds(
+    thing: str, narrow: float, turn: int
+) -> None:
+    low, high = np.array(bounds_of(TABLE, thing.format(turn)))
+    np.testing.assert_allclose(high, [0.5 - narrow, 0.4 - narrow], atol=2e-6)
+    np.testing.assert_allclose(low, -high, atol=2e-6)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +100,13 @@ def test_all_of_a_thing_stays_on_its_surface(scene: str, expected: list) -> None
         ('<geom type="box" size="0.5 0.4 0.05" pos="0 0 0.05"/>', {"joint": "<joint/>"}),
         ('<geom type="box" size="0.5 0.4 0.05" pos="0 0 0.05"/>', {"joint": ""}),
         # wider than what it lies on
-        ('<geom type="box" size="0.5 0.025 0.05" pos="0 0.2 0.05"/>', {}),
+        ('<geom type="box" size="0.5 0.015 0.05" pos="0 0.2 0.05"/>', {}),
+        # a table of two halves
+        (
+            '<geom type="box" size="0.25 0.4 0.05" pos="-0.25 0 0.05"/>'
+            '<geom type="box" size="0.25 0.4 0.05" pos="0.25 0 0.05"/>',
+            {},
+        ),
     ],
 )
 def test_of_other_surfaces_no_edge_is_known(scene: str, options: dict) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from numbered import ALGORITHMS, NumberedEnv, assert_true_episodes, learner, numbered
 from small_buffers import as_arrays, fill, make_buffer, make_env
-from stable_baselines3 import HerReplayBuffer
+from stable_baselines3 import PPO, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from toy import HORIZON, PointEnv, StraightPredictor, curriculum
@@ -17,6 +18,7 @@ from toy import HORIZON, PointEnv, StraightPredictor, curriculum
 from sb3_follow_object.callbacks.curriculum_callback import CurriculumCallback
 from sb3_follow_object.imagination.vec_env import ImaginedGoalVecEnv
 from sb3_follow_object.imagination.wrapper import ImaginedGoalWrapper
+from sb3_follow_object.replay.her_replay_buffer import FollowObjectReplayBuffer
 
 
 class StopAfter(BaseCallback):
@@ -240,9 +242,60 @@ def test_an_episode_that_goes_on_to_another_goal_stays_one(algorithm: str, face:
     assert set(np.unique(changes)) == {0, 1}
 
 
+def test_another_goal_without_going_on_is_another_episode() -> None:
+    """An environment that is reset unnoticed begins where it stood, for another original goal."""
+    env = DummyVecEnv([PointEnv])
+    buffer = FollowObjectReplayBuffer(40, env.observation_space, env.action_space, env, seed=0)
+    for goal in ([0.3, 0.0, 0.0], [0.0, 0.3, 0.0]):
+        for _ in range(3):
+            still = np.zeros((1, 3))
+            obs = {"observation": still, "achieved_goal": still, "desired_goal": np.array([goal])}
+            infos = [{"original_goal": np.array(goal), "imagined_level": 0}]
+            buffer.add(obs, obs, still, np.array([-1.0]), np.array([False]), infos)
+    buffer.end_episodes()
+    assert buffer.table.length[buffer.table.length > 0].tolist() == [3, 3]
+
+
+@pytest.mark.parametrize("saved", ["state", "pickle"])
+def test_an_episode_that_goes_on_after_it_was_saved_stays_one(saved: str) -> None:
+    env = DummyVecEnv([PointEnv])
+
+    def new() -> FollowObjectReplayBuffer:
+        return FollowObjectReplayBuffer(40, env.observation_space, env.action_space, env, seed=0)
+
+    def step(buffer: FollowObjectReplayBuffer, shown: float, then: float) -> None:
+        still = np.zeros((1, 3))
+        obs, later = (
+            {
+                "observation": still,
+                "achieved_goal": still,
+                "desired_goal": np.array([[goal, 0.0, 0.0]]),
+            }
+            for goal in (shown, then)
+        )
+        infos: list[dict[str, Any]] = [{"goes_on": True} if shown != then else {}]
+        buffer.add(obs, later, still, np.array([-1.0]), np.array([False]), infos)
+
+    buffer = new()
+    step(buffer, 0.1, 0.1)
+    step(buffer, 0.1, 0.3)
+    if saved == "state":
+        state, buffer = buffer.state_dict(), new()
+        buffer.load_state_dict(state)
+    else:
+        buffer = pickle.loads(pickle.dumps(buffer))
+        buffer.set_env(env)
+    step(buffer, 0.3, 0.3)
+    buffer.end_episodes()
+    assert buffer.table.length[buffer.table.length > 0].tolist() == [3]
+
+
 def test_what_would_store_the_next_goal_for_the_last_is_refused() -> None:
     levels = curriculum(go_on=True)
     env = ImaginedGoalVecEnv(DummyVecEnv([PointEnv]), StraightPredictor(), levels)
     model = learner("DDPG", env, replay_buffer_class=HerReplayBuffer)
-    with pytest.raises(ValueError, match=r"go_on shows another goal .* HerReplayBuffer would"):
+    with pytest.raises(ValueError, match=r"go_on shows another goal .* HerReplayBuffer would take"):
         model.learn(100, callback=CurriculumCallback())
+    on_policy = PPO("MultiInputPolicy", env, n_steps=10, batch_size=10, device="cpu")
+    with pytest.raises(ValueError, match=r"go_on shows another goal .* the model would take"):
+        on_policy.learn(100, callback=CurriculumCallback())
