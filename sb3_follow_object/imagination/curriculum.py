@@ -35,15 +35,16 @@ class Curriculum:
         n_levels: number of levels with levels="path", >= 1; "time" does not read it.
         sampling: "uniform" (paper) or "max", always k = k_max (the paper's ablation).
         min_distance: metres, >= 0; imagined goals nearer to the start than this are not shown.
-        go_on: whether an episode of training that reaches its imagined goal shows the original one
-            from then on, so that what is left of it is spent on the way ahead. The paper's stays.
+        go_on: share in [0, 1] of the episodes of training that show the original goal from where
+            they reach their imagined one, so that what is left of them is spent on the way ahead.
+            0 is the paper's.
 
     Raises:
         ValueError: an argument is outside its range.
     """
 
     stride = 1  # of those pickled before there was one
-    go_on = False  # likewise
+    go_on = 0.0  # likewise
     first_k_max = 1
 
     def __init__(
@@ -60,7 +61,7 @@ class Curriculum:
         n_levels: int = CurriculumSettings.n_levels,
         sampling: str = CurriculumSettings.sampling,
         min_distance: float = CurriculumSettings.min_distance,
-        go_on: bool = CurriculumSettings.go_on,
+        go_on: float = CurriculumSettings.go_on,
     ) -> None:
         settings = CurriculumSettings(
             p=p,
@@ -112,6 +113,15 @@ class Curriculum:
         if self.sampling == "max":
             return original, np.full(n, self.k_max, dtype=np.int64)
         return original, rng.integers(1, self.k_max, size=n, endpoint=True)
+
+    def draw_going_on(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw which of ``n`` new episodes go on once they reach their imagined goals, (n,) bool.
+
+        Where all do or none does, nothing is drawn.
+        """
+        if self.go_on in (0.0, 1.0):
+            return np.full(n, self.go_on == 1.0)
+        return rng.random(n) < self.go_on
 
     def drawable(self) -> np.ndarray:
         """Return the levels that ``draw`` can give now, shape (m,) int64, ascending."""

@@ -51,9 +51,6 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
     ``terminal_observation`` carries the shown goal too. Put VecMonitor outside, so that returns
     are those of the shown goals.
 
-    Where the curriculum lets episodes go on, the info of a step that reached its imagined goal has
-    ``goes_on``: the observation after it shows the original goal, which the next step is for.
-
     It imagines from its first reset, as ``ImaginedGoalWrapper`` does that is given a Curriculum.
 
     Args:
@@ -109,6 +106,7 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
         self._shown = np.zeros((venv.num_envs, self._space.size), self._dtype)
         self._original = self._shown.copy()
         self._level = np.zeros(venv.num_envs, dtype=np.int64)
+        self._may_go_on = np.zeros(venv.num_envs, dtype=bool)
         self._start = np.zeros((venv.num_envs, self._space.size))
         self._contexts = np.zeros((venv.num_envs, len(predictor.context)))
         _read_contexts(venv, [], predictor.context)  # refused now rather than at the first reset
@@ -171,10 +169,10 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
             last = infos[i]["terminal_observation"]
             last = {**last, "desired_goal": self._shown[i].copy()}
             infos[i] |= {"terminal_observation": last, LAST: last}
-        if self.curriculum.go_on and self.mode == "train":
-            for i in np.flatnonzero(success & (self._level > 0) & (np.asarray(dones) == 0)):
-                self._shown[i], self._level[i] = self._original[i], 0
-                infos[i][GOES_ON] = True
+        arrived = success & (self._level > 0) & (np.asarray(dones) == 0)
+        for i in np.flatnonzero(arrived & self._may_go_on):
+            self._shown[i], self._level[i] = self._original[i], 0
+            infos[i][GOES_ON] = True
         if ended.size:
             self._draw(ended, obs)
         return self._relabel(obs), rewards, dones, infos
@@ -211,6 +209,7 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
             "shown": self._shown.copy(),
             "original": self._original.copy(),
             "level": self._level.copy(),
+            "may_go_on": self._may_go_on.copy(),
             "start": self._start.copy(),
             "rng": copy.deepcopy(self._rng.bit_generator.state),
         }
@@ -223,8 +222,8 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
     def set_state(self, state: dict[str, Any]) -> None:
         """Continue from ``get_state`` of a wrapper of the same size."""
         contexts = ("contexts",) if self.predictor.context else ()
-        starts = ("start",) if "start" in state else ()  # states of before 0.2.0 had none
-        for name in ("shown", "original", "level", *starts, *contexts):
+        new = [name for name in ("start", "may_go_on") if name in state]  # since 0.2.0
+        for name in ("shown", "original", "level", *new, *contexts):
             current, saved = getattr(self, f"_{name}"), np.asarray(state[name])
             if saved.shape != current.shape:
                 raise ValueError(
@@ -253,11 +252,13 @@ class ImaginedGoalVecEnv(CopyableVecEnvWrapper):
         start, goal = obs["achieved_goal"][rows], obs["desired_goal"][rows]
         predictor, curriculum = self.predictor, self.curriculum
         contexts = self._contexts[rows] = _read_contexts(self.venv, rows, predictor.context)
+        self._may_go_on[rows] = False
         if self.mode == "test":
             level = np.full(len(rows), curriculum.k_max)
             shown = imagine(predictor, curriculum, start, goal, level, contexts)
         else:
             shown, level = draw_goals(predictor, curriculum, start, goal, self._rng, contexts)
+            self._may_go_on[rows] = curriculum.draw_going_on(len(rows), self._rng)
         with np.errstate(under="ignore"):
             self._shown[rows], self._original[rows], self._level[rows] = shown, goal, level
         self._start[rows] = start

@@ -53,11 +53,10 @@ class ImaginedGoalWrapper(
 
     Infos carry ``original_goal`` (3,) in metres, ``imagined_level`` (0 where the original goal is
     shown) and, after each step, ``is_success`` for the shown and ``original_success`` for the
-    original goal; ``context`` (c,), too, if F_phi sees the places of other things; and ``goes_on``
-    where the curriculum lets the episode go on: the observation after that step shows the original
-    goal, which the next step is for. When an episode
-    ends is left to the environment: one that terminates on its goal still does so on the original
-    one.
+    original goal; ``context`` (c,), too, if F_phi sees the places of other things. With the
+    curriculum's ``go_on`` a step that reaches the imagined goal may say ``goes_on``: the
+    observation after it shows the original goal, which the next step is for. When an episode ends
+    is left to the environment: one that terminates on its goal still does so on the original one.
 
     A wrapper that is given a Curriculum imagines goals at once. One that is given settings shows
     original goals until a CurriculumCallback takes it up at the start of training. So the same
@@ -113,7 +112,7 @@ class ImaginedGoalWrapper(
             check_made_for(predictor, env.spec)
         self._rng = np.random.default_rng()
         self._shown = self._original = np.zeros(self._space.size, self._dtype)
-        self._level = 0
+        self._level, self._may_go_on = 0, False
         self._start = np.zeros(self._space.size)
         self._context = np.zeros(0)  # where other things stand that F_phi sees
 
@@ -135,7 +134,7 @@ class ImaginedGoalWrapper(
         for key in ("achieved_goal", "desired_goal"):
             check_shape(obs[key], (self._space.size,), f"the observation {key!r}")
         self._original = obs["desired_goal"].copy()
-        self._shown, self._level = self._original, 0
+        self._shown, self._level, self._may_go_on = self._original, 0, False
         self._start = np.array(obs["achieved_goal"], dtype=np.float64)
         if self.active or isinstance(self._predictor, GoalPredictor):
             self._context = read_context(self.predictor.context, self.env)
@@ -143,6 +142,8 @@ class ImaginedGoalWrapper(
             shown, level = self._draw(obs["achieved_goal"][None], obs["desired_goal"][None])
             with np.errstate(under="ignore"):
                 self._shown, self._level = shown[0].astype(self._dtype), int(level[0])
+            if self.mode == "train":
+                self._may_go_on = bool(self.curriculum.draw_going_on(1, self._rng)[0])
         return self._relabel(obs), {**info, **self._facts()}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -162,8 +163,7 @@ class ImaginedGoalWrapper(
             "original_success": self._succeeds(achieved, self._original),
         }
         ended = terminated or truncated
-        may_go_on = self.curriculum.go_on and self.mode == "train" and self._level > 0
-        if may_go_on and info["is_success"] and not ended:
+        if self._may_go_on and self._level > 0 and info["is_success"] and not ended:
             self._shown, self._level = self._original, 0
             info[GOES_ON] = True
         obs = self._relabel(obs)

@@ -50,8 +50,14 @@ class CurriculumSettings(Group):
         setting("imagined goals nearer to the start are not shown", unit="metres", ge=0),
     ] = 0.0
     go_on: Annotated[
-        Flag, setting("whether an episode that reaches its imagined goal goes on to the original")
-    ] = False
+        Number,
+        setting(
+            "share of the training's episodes that go on to the original goal where they reach "
+            "their imagined one; needs FollowObjectReplayBuffer",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.0
 
 
 @dataclass(frozen=True)

@@ -273,7 +273,7 @@ def test_the_gymnasium_wrapper_shows_goals_in_the_same_way() -> None:
 
 @pytest.mark.parametrize("batched", [True, False])
 def test_an_episode_that_reaches_its_imagined_goal_goes_on_to_the_original(batched: bool) -> None:
-    curriculum = toy.curriculum(k_max=3, p=0.3, go_on=True)
+    curriculum = toy.curriculum(k_max=3, p=0.3, go_on=1.0)
     venv: VecEnv = (
         imagining(curriculum) if batched else DummyVecEnv([lambda: single(curriculum)] * N)
     )
@@ -295,8 +295,33 @@ def test_an_episode_that_reaches_its_imagined_goal_goes_on_to_the_original(batch
     assert went_on > 10
 
 
+@pytest.mark.parametrize("batched", [True, False])
+@pytest.mark.parametrize(("share", "expected"), [(0.0, 0.0), (0.3, 0.3), (1.0, 1.0)])
+def test_a_share_of_the_episodes_goes_on(batched: bool, share: float, expected: float) -> None:
+    curriculum = toy.curriculum(k_max=1, p=0.0, go_on=share)
+    venv: VecEnv = (
+        imagining(curriculum) if batched else DummyVecEnv([lambda: single(curriculum)] * N)
+    )
+    arrived = went_on = 0
+    for episode in episodes(venv, 1500):
+        early = [step["info"]["is_success"] for step in episode[:-1]]
+        arrived += any(early)
+        went_on += any(step["info"].get("goes_on", False) for step in episode)
+    assert arrived > 150
+    assert went_on / arrived == pytest.approx(expected, abs=0.1)
+
+
+def test_an_episode_that_is_to_go_on_still_is_after_it_was_saved() -> None:
+    first, second = (imagining(toy.curriculum(k_max=3, p=0.2, go_on=0.5)) for _ in range(2))
+    first.reset()
+    second.reset()
+    second.set_state(first.get_state())
+    np.testing.assert_array_equal(first._may_go_on, second._may_go_on)
+    assert set(first._may_go_on.tolist()) == {True, False}
+
+
 def test_tests_of_h_max_do_not_go_on() -> None:
-    curriculum = toy.curriculum(k_max=2, go_on=True)
+    curriculum = toy.curriculum(k_max=2, go_on=1.0)
     finished = episodes(imagining(curriculum, "test"), 200)
     check_transitions(curriculum, finished)
     assert any(step["info"]["is_success"] for episode in finished for step in episode[:-1])

@@ -216,7 +216,7 @@ def test_the_curriculum_callback_lets_stock_algorithms_begin_anew(name: str) -> 
 @pytest.mark.parametrize("face", ["batched", "single"])
 @pytest.mark.parametrize("algorithm", ["HerDDPG", "DDPG"])
 def test_an_episode_that_goes_on_to_another_goal_stays_one(algorithm: str, face: str) -> None:
-    levels = curriculum(k_max=3, p=0.2, go_on=True)
+    levels = curriculum(k_max=3, p=0.2, go_on=1.0)
     env: VecEnv
     if face == "batched":
         env = ImaginedGoalVecEnv(DummyVecEnv([PointEnv] * 3), StraightPredictor(), levels)
@@ -291,7 +291,7 @@ def test_an_episode_that_goes_on_after_it_was_saved_stays_one(saved: str) -> Non
 
 
 def test_what_would_store_the_next_goal_for_the_last_is_refused() -> None:
-    levels = curriculum(go_on=True)
+    levels = curriculum(go_on=1.0)
     env = ImaginedGoalVecEnv(DummyVecEnv([PointEnv]), StraightPredictor(), levels)
     model = learner("DDPG", env, replay_buffer_class=HerReplayBuffer)
     with pytest.raises(ValueError, match=r"go_on shows another goal .* HerReplayBuffer would take"):
