@@ -67,6 +67,9 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarra
 
 def _narrowest(points: np.ndarray) -> float:
     """How far points (n, 2) reach beside 0 in the direction in which they reach least far."""
+    turns = np.radians(np.arange(0.0, 360.0, 2.0))
+    farthest = np.stack([np.cos(turns), np.sin(turns)], axis=1) @ points.T
+    points = points[np.unique(farthest.argmax(axis=1))]  # of the hull alone, as pairs are many
     sides = (points[:, None] - points).reshape(-1, 2)
     length = np.linalg.norm(sides, axis=1)
     ahead = sides[length > 0.0] / length[length > 0.0, None]

@@ -83,6 +83,13 @@ def test_how_a_thing_is_turned_does_not_move_its_bounds(
     np.testing.assert_allclose(low, -high, atol=2e-6)
 
 
+def test_of_a_thing_of_many_parts_those_at_its_rim_count() -> None:
+    at = np.random.default_rng(0).uniform([-0.1, -0.05], [0.1, 0.05], (300, 2))
+    parts = [f'<geom type="box" size="0.01 0.01 0.04" pos="{x} {y} 0"/>' for x, y in at]
+    rim = '<geom type="box" size="0.12 0.07 0.04"/>'
+    assert bounds_of(TABLE, rim + "".join(parts)) == [[-0.43, -0.33], [0.43, 0.33]]
+
+
 @pytest.mark.parametrize(
     ("scene", "options"),
     [
