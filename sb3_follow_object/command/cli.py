@@ -170,7 +170,7 @@ def _config(args: argparse.Namespace) -> RunConfig:
         file=args.config,
         seed=args.seed or 0,
         overrides=overrides_of(args),
-        report=_warn_once(args),
+        report=_told(args),
     )
     for text in args.set:
         if why := unread(text.split("=")[0], config):
@@ -255,16 +255,9 @@ def _warn(sentence: str) -> None:
     print(f"{PROGRAM}: {sentence}", file=sys.stderr)
 
 
-def _warn_once(args: argparse.Namespace) -> Report:
-    """Return what prints each sentence once, or with `--quiet` none."""
-    said: set[str] = set()
-
-    def say(sentence: str) -> None:
-        if sentence not in said:
-            said.add(sentence)
-            _warn(sentence)
-
-    return (lambda sentence: None) if getattr(args, "quiet", False) else say
+def _told(args: argparse.Namespace) -> Report:
+    """Return what prints a sentence, or with `--quiet` does not."""
+    return (lambda sentence: None) if getattr(args, "quiet", False) else _warn
 
 
 def _watch(args: argparse.Namespace) -> None:
@@ -315,7 +308,7 @@ def _compare(args: argparse.Namespace) -> None:
     settings = Settings(args.steps, args.preset, overrides, args.paper_evaluation)
     grid = (args.out, args.tasks, args.methods, args.seeds, settings)
     # What is invalid is refused before a cluster is asked for.
-    wanted = plan(*grid, report=_warn_once(args))
+    wanted = plan(*grid, report=_told(args))
     left = runs_left(args.out, wanted, args.retry_failed)
     executor: Executor
     if args.ray is None:

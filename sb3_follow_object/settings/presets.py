@@ -102,8 +102,7 @@ def run_config(
         file: YAML in rl_zoo3's layout, in place of a preset.
         seed: of the run.
         overrides: settings by their dotted names, e.g. {"curriculum.p": 0.5}; they win.
-        report: called with a sentence where looking at a task of others may take minutes, and
-            where its settings are those for any task since its object cannot be followed.
+        report: called with a sentence where looking at a task of others may take minutes.
 
     Raises:
         ValueError: an invalid id, file, key or value, with the nearest valid one.
@@ -196,8 +195,7 @@ def _similar_settings(known: ZooFile, env_id: str, imagine: bool, report: Report
     """Return what a file says of the package's task that is most similar to one of others."""
     try:
         derived(env_id, report)
-    except ValueError as error:  # a method without imagined goals can do without
-        report(f"{error}; its settings are those of any task")
+    except ValueError:  # nothing can be followed, which a method without imagined goals need not
         return known.settings(env_id)
     on_surface = surface_choices(env_id)[0]
     settings = known.settings(SIMILAR[True] if on_surface else env_id)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import os
@@ -21,7 +20,7 @@ from short_films import record_an_episode
 
 from sb3_follow_object.any_task.tasks import kept_as
 from sb3_follow_object.command import pictures
-from sb3_follow_object.command.cli import _print_table, _warn_once, main
+from sb3_follow_object.command.cli import _print_table, main
 from sb3_follow_object.common import extras
 from sb3_follow_object.common.files import LOCK, lock
 from sb3_follow_object.common.reports import Trouble
@@ -347,16 +346,6 @@ def test_quiet_does_not_hide_trouble(capsys: pytest.CaptureFixture[str]) -> None
     terminal.say(Trouble("the disk is full"))
     printed = capsys.readouterr()
     assert (printed.out, printed.err) == ("", "the disk is full\n")
-
-
-@pytest.mark.parametrize(("quiet", "times"), [(False, 1), (True, 0)])
-def test_what_several_runs_of_a_plan_say_is_printed_once(
-    quiet: bool, times: int, capsys: pytest.CaptureFixture[str]
-) -> None:
-    report = _warn_once(argparse.Namespace(quiet=quiet))
-    for _ in range(3):
-        report("its settings are those of any task")
-    assert capsys.readouterr().err.count("of any task") == times
 
 
 def test_the_speed_is_told_from_the_second_figure_on(monkeypatch: pytest.MonkeyPatch) -> None:

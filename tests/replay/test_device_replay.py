@@ -241,7 +241,7 @@ def test_what_needs_the_host_is_refused_in_a_sentence() -> None:
     fill([buffer], env, HORIZON)
     replay = mirror(buffer)
     buffer.goals_are_shared = False
-    with pytest.raises(ValueError, match="goals that stay the same"):
+    with pytest.raises(ValueError, match="goals that are the same"):
         replay.refresh(buffer)
 
 
@@ -287,11 +287,11 @@ def test_a_goal_that_moves_sends_replay_back_to_the_host() -> None:
         env = DummyVecEnv([MovingGoal] * 2)
         return HerDDPG("MultiInputPolicy", env, **TINY, replay_on_device=True, seed=0)
 
-    with pytest.raises(ValueError, match="goals that stay the same"):
+    with pytest.raises(ValueError, match="goals that are the same"):
         learner().learn(40)
     model = learner()
     model.replay_on_device = None
-    with pytest.warns(UserWarning, match="goes on on the host: .* goals that stay the same"):
+    with pytest.warns(UserWarning, match="goes on on the host: .* goals that are the same"):
         model.learn(40)
     assert model._device_replay is None and model._n_updates > 0
 
