@@ -242,52 +242,48 @@ def test_an_episode_that_goes_on_to_another_goal_stays_one(algorithm: str, face:
     assert set(np.unique(changes)) == {0, 1}
 
 
+def one_copy() -> FollowObjectReplayBuffer:
+    env = DummyVecEnv([PointEnv])
+    return FollowObjectReplayBuffer(40, env.observation_space, env.action_space, env, seed=0)
+
+
+def stand(buffer: FollowObjectReplayBuffer, shown: float, then: float, info: Any = None) -> None:
+    """Store a step at 0 for the goal at x = shown that ends with one at x = then."""
+    still = np.zeros((1, 3))
+    obs, later = (
+        {"observation": still, "achieved_goal": still, "desired_goal": np.array([[x, 0.0, 0.0]])}
+        for x in (shown, then)
+    )
+    buffer.add(obs, later, still, np.array([-1.0]), np.array([False]), [info or {}])
+
+
+def lengths(buffer: FollowObjectReplayBuffer) -> list[int]:
+    buffer.end_episodes()
+    return buffer.table.length[buffer.table.length > 0].tolist()
+
+
 def test_another_goal_without_going_on_is_another_episode() -> None:
     """An environment that is reset unnoticed begins where it stood, for another original goal."""
-    env = DummyVecEnv([PointEnv])
-    buffer = FollowObjectReplayBuffer(40, env.observation_space, env.action_space, env, seed=0)
-    for goal in ([0.3, 0.0, 0.0], [0.0, 0.3, 0.0]):
+    buffer = one_copy()
+    for goal in (0.1, 0.3):
         for _ in range(3):
-            still = np.zeros((1, 3))
-            obs = {"observation": still, "achieved_goal": still, "desired_goal": np.array([goal])}
-            infos = [{"original_goal": np.array(goal), "imagined_level": 0}]
-            buffer.add(obs, obs, still, np.array([-1.0]), np.array([False]), infos)
-    buffer.end_episodes()
-    assert buffer.table.length[buffer.table.length > 0].tolist() == [3, 3]
+            stand(buffer, goal, goal, {"imagined_level": 0})
+    assert lengths(buffer) == [3, 3]
 
 
 @pytest.mark.parametrize("saved", ["state", "pickle"])
 def test_an_episode_that_goes_on_after_it_was_saved_stays_one(saved: str) -> None:
-    env = DummyVecEnv([PointEnv])
-
-    def new() -> FollowObjectReplayBuffer:
-        return FollowObjectReplayBuffer(40, env.observation_space, env.action_space, env, seed=0)
-
-    def step(buffer: FollowObjectReplayBuffer, shown: float, then: float) -> None:
-        still = np.zeros((1, 3))
-        obs, later = (
-            {
-                "observation": still,
-                "achieved_goal": still,
-                "desired_goal": np.array([[goal, 0.0, 0.0]]),
-            }
-            for goal in (shown, then)
-        )
-        infos: list[dict[str, Any]] = [{"goes_on": True} if shown != then else {}]
-        buffer.add(obs, later, still, np.array([-1.0]), np.array([False]), infos)
-
-    buffer = new()
-    step(buffer, 0.1, 0.1)
-    step(buffer, 0.1, 0.3)
+    buffer = one_copy()
+    stand(buffer, 0.1, 0.1)
+    stand(buffer, 0.1, 0.3, {"goes_on": True})
     if saved == "state":
-        state, buffer = buffer.state_dict(), new()
+        state, buffer = buffer.state_dict(), one_copy()
         buffer.load_state_dict(state)
     else:
         buffer = pickle.loads(pickle.dumps(buffer))
-        buffer.set_env(env)
-    step(buffer, 0.3, 0.3)
-    buffer.end_episodes()
-    assert buffer.table.length[buffer.table.length > 0].tolist() == [3]
+        buffer.set_env(DummyVecEnv([PointEnv]))
+    stand(buffer, 0.3, 0.3)
+    assert lengths(buffer) == [3]
 
 
 def test_what_would_store_the_next_goal_for_the_last_is_refused() -> None:
